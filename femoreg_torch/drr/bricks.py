@@ -1,0 +1,55 @@
+"""Where a volume is empty: a map of bricks that tells how far a packet of rays may leap."""
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from femoreg_torch.volume.grid import Volume
+
+BRICK = 4  # voxels along each edge; the kernels find a brick with a shift by 2
+SPREAD = 2  # voxels that a ray may stray from the middle of its packet
+RIM = 8  # voxels of zeros around the volume: SPREAD twice, plus a brick, so that no ray of a packet leaves the array
+
+
+@dataclass(frozen=True)
+class BrickedVolume:
+    """A volume with a rim of zeros, and for every brick the distance to the nearest one that is not empty.
+
+    `padded` is (Z + 2·RIM, …) rounded up to whole bricks. `leap` counts bricks in the chessboard metric: 0 where a sample
+    within SPREAD of the brick may be non-zero, n where all bricks closer than n are empty.
+    """
+
+    padded: NDArray[np.float32]
+    leap: NDArray[np.uint8]
+    shape: tuple[int, int, int]  # of the volume itself
+    version: int
+
+
+_cache: WeakKeyDictionary[Volume, BrickedVolume] = WeakKeyDictionary()
+
+
+def bricked(volume: Volume) -> BrickedVolume:
+    """The bricked form of a volume on the CPU, computed once per volume (and again if its data were changed)."""
+    known = _cache.get(volume)
+    if known is None or known.version != volume.data._version:
+        known = _build(volume.data.detach().numpy(), volume.data._version)
+        _cache[volume] = known
+    return known
+
+
+def _build(data: NDArray[np.float32], version: int) -> BrickedVolume:
+    bricks = [-(-(n + 2 * RIM) // BRICK) for n in data.shape]
+    padded = np.zeros([b * BRICK for b in bricks], np.float32)
+    padded[tuple(slice(RIM, RIM + n) for n in data.shape)] = data
+    # A sample reads the voxel below it and the one above, and lies up to SPREAD from the middle of its packet.
+    near = ndimage.maximum_filter(padded != 0, size=2 * SPREAD + 2, origin=-1)
+    filled = near.reshape(bricks[0], BRICK, bricks[1], BRICK, bricks[2], BRICK).any((1, 3, 5))
+    depth, height, width = data.shape
+    if filled.any():
+        leap = ndimage.distance_transform_cdt(~filled, metric="chessboard").clip(0, 255).astype(np.uint8)
+    else:
+        leap = np.full(filled.shape, 255, np.uint8)
+    return BrickedVolume(padded, leap, (depth, height, width), version)

@@ -1,0 +1,404 @@
+"""The projector on the CPU: compiled by numba, all cores, leaping over empty space in packets of rays.
+
+All kernels walk the rays of one volume in the same way. A ray is `source + t · direction` in padded index space, t in mm
+from the X-ray source; samples lie at whole multiples of the step, so that neither the batch nor the place of the volume
+moves them. The detector is cut into square packets, small enough that all rays of one stay within SPREAD voxels of its
+middle. The middle ray alone finds the runs of samples that may see something; every ray of the packet then takes them.
+"""
+
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from femoreg_torch.drr.bricks import BRICK, RIM, SPREAD, BrickedVolume
+from femoreg_torch.geometry.camera import Camera
+
+_flags = {"contract", "reassoc", "nsz", "arcp"}  # nan and inf keep their meaning
+_jit = nb.njit(cache=True, fastmath=_flags, error_model="numpy")
+_parallel = nb.njit(cache=True, fastmath=_flags, error_model="numpy", parallel=True)
+
+_SHIFT = BRICK.bit_length() - 1
+_MOST_RUNS = 256  # per ray; a ray through 1,024 bricks that are filled and empty by turns has fewer
+_MOST_RAYS = 8  # along the edge of a packet
+
+Array = NDArray[np.float64]
+
+
+# Geometry of one ray -------------------------------------------------------------------------------------------------
+@_jit
+def _ray(affine, detector, row, column):  # type: ignore[no-untyped-def]
+    """Unit ray of a pixel in the camera frame, and its direction in index space per mm."""
+    x = (column - detector[3]) * detector[2]
+    y = (row - detector[4]) * detector[1]
+    z = detector[0]
+    scale = 1.0 / math.sqrt(x * x + y * y + z * z)
+    x, y, z = x * scale, y * scale, z * scale
+    dx = affine[0, 0] * x + affine[0, 1] * y + affine[0, 2] * z
+    dy = affine[1, 0] * x + affine[1, 1] * y + affine[1, 2] * z
+    dz = affine[2, 0] * x + affine[2, 1] * y + affine[2, 2] * z
+    return x, y, z, dx, dy, dz
+
+
+@_jit
+def _clip(source, direction, size, margin, enter, leave):  # type: ignore[no-untyped-def]
+    """Narrow [enter, leave] to where margin ≤ source + t · direction ≤ size − 1 − margin."""
+    low, high = margin, size - 1.0 - margin
+    if direction != 0.0:
+        a = (low - source) / direction
+        b = (high - source) / direction
+        return max(enter, min(a, b)), min(leave, max(a, b))
+    if source < low or source > high:
+        return 1.0, 0.0
+    return enter, leave
+
+
+@_jit
+def _bounds(shape, margin, step, source, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """First and last sample of a ray at least `margin` voxels inside the padded volume; last < first if none."""
+    enter, leave = _clip(source[0], dx, shape[2], margin, 0.0, 1e9)
+    enter, leave = _clip(source[1], dy, shape[1], margin, enter, leave)
+    enter, leave = _clip(source[2], dz, shape[0], margin, enter, leave)
+    if leave < enter:
+        return 0, -1
+    return int(math.ceil(enter / step + 1e-9)), int(math.floor(leave / step - 1e-9))
+
+
+@_jit
+def _exit(source, inverse, low, high):  # type: ignore[no-untyped-def]
+    """Distance along the ray at which it leaves the slab [low, high]; `inverse` is 1 / direction."""
+    return ((high if inverse > 0.0 else low) - source) * inverse
+
+
+@_jit
+def _inverse(direction):  # type: ignore[no-untyped-def]
+    return 1.0 / direction if abs(direction) > 1e-12 else 1e12
+
+
+@_jit
+def _runs(leap, shape, step, source, dx, dy, dz, starts, ends):  # type: ignore[no-untyped-def]
+    """Runs of samples [start, end) of a packet's middle ray that may see something; returns how many."""
+    k, last = _bounds(shape, float(SPREAD), step, source, dx, dy, dz)
+    x, y, z, size, per_step = source[0], source[1], source[2], float(BRICK), 1.0 / step
+    ix, iy, iz = _inverse(dx), _inverse(dy), _inverse(dz)
+    n = 0
+    while k <= last:
+        t = k * step
+        bx, by, bz = int(x + t * dx) >> _SHIFT, int(y + t * dy) >> _SHIFT, int(z + t * dz) >> _SHIFT
+        distance = leap[bz, by, bx]
+        reach = distance - 1 if distance > 0 else 0
+        out = min(
+            _exit(x, ix, (bx - reach) * size, (bx + 1 + reach) * size),
+            _exit(y, iy, (by - reach) * size, (by + 1 + reach) * size),
+            _exit(z, iz, (bz - reach) * size, (bz + 1 + reach) * size),
+        )
+        beyond = min(max(k + 1, int(out * per_step) + 1), last + 1)
+        if distance == 0:
+            if n > 0 and (ends[n - 1] == k or n == _MOST_RUNS):
+                ends[n - 1] = beyond
+            else:
+                starts[n], ends[n] = k, beyond
+                n += 1
+        k = beyond
+    return n
+
+
+# Sums along one run of one ray ---------------------------------------------------------------------------------------
+@_jit
+def _lowest(source, direction, t0, t1):  # type: ignore[no-untyped-def]
+    """Lowest voxel that a run touches along one axis, and the float32 offset of its first sample from it."""
+    first = source + t0 * direction
+    low = int(min(first, source + t1 * direction))
+    return low, np.float32(first - low)
+
+
+@_jit
+def _start(source, first, end, step, dx, dy, dz, height, width):  # type: ignore[no-untyped-def]
+    """A run's lowest corner (as a flat index), the offset of its first sample from it, and the offset per sample."""
+    i, x = _lowest(source[0], dx, first * step, (end - 1) * step)
+    j, y = _lowest(source[1], dy, first * step, (end - 1) * step)
+    k, z = _lowest(source[2], dz, first * step, (end - 1) * step)
+    base = (k * height + j) * width + i
+    return base, x, y, z, np.float32(dx * step), np.float32(dy * step), np.float32(dz * step)
+
+
+@_jit
+def _integral(flat, height, width, first, end, step, source, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Sum of the trilinear values of samples first … end − 1. Offsets are float32, from the run's lowest voxel."""
+    base, x0, y0, z0, ax, ay, az = _start(source, first, end, step, dx, dy, dz, height, width)
+    row, slab = np.int32(width), np.int32(height * width)
+    total = np.float32(0.0)
+    for n in range(end - first):
+        s = np.float32(n)
+        x, y, z = x0 + s * ax, y0 + s * ay, z0 + s * az
+        i, j, k = np.int32(x), np.int32(y), np.int32(z)
+        u, v, w = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+        p = np.uintp(base + np.int64(k * slab + j * row + i))
+        q, r = p + np.uintp(width), p + np.uintp(height * width)
+        s4 = r + np.uintp(width)
+        a0 = flat[p] + v * (flat[q] - flat[p])
+        a1 = flat[p + np.uintp(1)] + v * (flat[q + np.uintp(1)] - flat[p + np.uintp(1)])
+        b0 = flat[r] + v * (flat[s4] - flat[r])
+        b1 = flat[r + np.uintp(1)] + v * (flat[s4 + np.uintp(1)] - flat[r + np.uintp(1)])
+        a0 += w * (b0 - a0)
+        a1 += w * (b1 - a1)
+        total += a0 + u * (a1 - a0)
+    return total
+
+
+@_jit
+def _moments(flat, height, width, first, end, step, source, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Σ slope (3) and Σ t · slope (3) over a run: all that a derivative with respect to the affine needs; then Σ value."""
+    base, x0, y0, z0, ax, ay, az = _start(source, first, end, step, dx, dy, dz, height, width)
+    row, slab = np.int32(width), np.int32(height * width)
+    sx = sy = sz = np.float32(0.0)  # Σ slope
+    nx = ny = nz = np.float32(0.0)  # Σ n · slope, n counted from the run's first sample
+    total = np.float32(0.0)
+    for n in range(end - first):
+        s = np.float32(n)
+        x, y, z = x0 + s * ax, y0 + s * ay, z0 + s * az
+        i, j, k = np.int32(x), np.int32(y), np.int32(z)
+        u, v, w = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+        p = np.uintp(base + np.int64(k * slab + j * row + i))
+        q, r = p + np.uintp(width), p + np.uintp(height * width)
+        s4 = r + np.uintp(width)
+        c000, c001 = flat[p], flat[p + np.uintp(1)]
+        c010, c011 = flat[q], flat[q + np.uintp(1)]
+        c100, c101 = flat[r], flat[r + np.uintp(1)]
+        c110, c111 = flat[s4], flat[s4 + np.uintp(1)]
+        d00, d01, d10, d11 = c001 - c000, c011 - c010, c101 - c100, c111 - c110
+        e0, e1 = d00 + v * (d01 - d00), d10 + v * (d11 - d10)
+        a, b = c000 + u * d00, c010 + u * d01
+        c, d = c100 + u * d10, c110 + u * d11
+        low, high = a + v * (b - a), c + v * (d - c)
+        gx, gy, gz = e0 + w * (e1 - e0), (b - a) + w * ((d - c) - (b - a)), high - low
+        sx += gx
+        sy += gy
+        sz += gz
+        nx += s * gx
+        ny += s * gy
+        nz += s * gz
+        total += low + w * (high - low)
+    t = first * step
+    return sx, sy, sz, t * sx + step * nx, t * sy + step * ny, t * sz + step * nz, total
+
+
+# Kernels: poses × packets, shared out among the cores ----------------------------------------------------------------
+@_parallel
+def _forward(padded, leap, affines, detector, step, edge, workers, out):  # type: ignore[no-untyped-def]
+    poses, rows, columns = out.shape
+    flat = padded.reshape(-1)
+    height, width = padded.shape[1], padded.shape[2]
+    bands = -(-rows // edge)
+    for worker in nb.prange(workers):
+        starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
+        for band in range(worker, poses * bands, workers):
+            pose, top = band // bands, (band % bands) * edge
+            affine, bottom = affines[pose], min(top + edge, rows)
+            source = affine[:, 3]
+            for left in range(0, columns, edge):
+                right = min(left + edge, columns)
+                _, _, _, dx, dy, dz = _ray(affine, detector, (top + bottom - 1) / 2, (left + right - 1) / 2)
+                n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
+                if n > 0:
+                    for row in range(top, bottom):
+                        for column in range(left, right):
+                            _, _, _, dx, dy, dz = _ray(affine, detector, row, column)
+                            total = np.float32(0.0)
+                            for i in range(n):
+                                total += _integral(
+                                    flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
+                                )
+                            out[pose, row, column] += np.float32(step) * total
+
+
+@_parallel
+def _derivative(padded, leap, affines, detector, step, edge, workers, upstream, parts):  # type: ignore[no-untyped-def]
+    poses, rows, columns = upstream.shape
+    flat = padded.reshape(-1)
+    height, width = padded.shape[1], padded.shape[2]
+    bands = -(-rows // edge)
+    for worker in nb.prange(workers):
+        starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
+        for band in range(worker, poses * bands, workers):
+            pose, top = band // bands, (band % bands) * edge
+            affine, bottom = affines[pose], min(top + edge, rows)
+            source, mine = affine[:, 3], parts[worker, pose]
+            for left in range(0, columns, edge):
+                right = min(left + edge, columns)
+                _, _, _, dx, dy, dz = _ray(affine, detector, (top + bottom - 1) / 2, (left + right - 1) / 2)
+                n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
+                if n > 0:
+                    for row in range(top, bottom):
+                        for column in range(left, right):
+                            weight = step * upstream[pose, row, column]
+                            if weight != 0.0:
+                                x, y, z, dx, dy, dz = _ray(affine, detector, row, column)
+                                for i in range(n):
+                                    sx, sy, sz, tx, ty, tz, _ = _moments(
+                                        flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
+                                    )
+                                    mine[0, 0] += weight * tx * x
+                                    mine[0, 1] += weight * tx * y
+                                    mine[0, 2] += weight * tx * z
+                                    mine[0, 3] += weight * sx
+                                    mine[1, 0] += weight * ty * x
+                                    mine[1, 1] += weight * ty * y
+                                    mine[1, 2] += weight * ty * z
+                                    mine[1, 3] += weight * sy
+                                    mine[2, 0] += weight * tz * x
+                                    mine[2, 1] += weight * tz * y
+                                    mine[2, 2] += weight * tz * z
+                                    mine[2, 3] += weight * sz
+
+
+@_parallel
+def _jacobian(padded, leap, affines, changes, detector, step, edge, workers, image, out):  # type: ignore[no-untyped-def]
+    poses, rows, columns, dofs = out.shape
+    flat = padded.reshape(-1)
+    height, width = padded.shape[1], padded.shape[2]
+    bands = -(-rows // edge)
+    for worker in nb.prange(workers):
+        starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
+        for band in range(worker, poses * bands, workers):
+            pose, top = band // bands, (band % bands) * edge
+            affine, bottom = affines[pose], min(top + edge, rows)
+            source = affine[:, 3]
+            for left in range(0, columns, edge):
+                right = min(left + edge, columns)
+                _, _, _, dx, dy, dz = _ray(affine, detector, (top + bottom - 1) / 2, (left + right - 1) / 2)
+                n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
+                if n > 0:
+                    for row in range(top, bottom):
+                        for column in range(left, right):
+                            x, y, z, dx, dy, dz = _ray(affine, detector, row, column)
+                            sx = sy = sz = tx = ty = tz = total = 0.0
+                            for i in range(n):
+                                ax, ay, az, bx, by, bz, value = _moments(
+                                    flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
+                                )
+                                sx += ax
+                                sy += ay
+                                sz += az
+                                tx += bx
+                                ty += by
+                                tz += bz
+                                total += value
+                            image[pose, row, column] = step * total
+                            for dof in range(dofs):
+                                c = changes[pose, dof]
+                                out[pose, row, column, dof] = step * (
+                                    tx * (c[0, 0] * x + c[0, 1] * y + c[0, 2] * z)
+                                    + ty * (c[1, 0] * x + c[1, 1] * y + c[1, 2] * z)
+                                    + tz * (c[2, 0] * x + c[2, 1] * y + c[2, 2] * z)
+                                    + sx * c[0, 3]
+                                    + sy * c[1, 3]
+                                    + sz * c[2, 3]
+                                )
+
+
+@_parallel
+def _scatter(affines, detector, step, workers, upstream, parts):  # type: ignore[no-untyped-def]
+    poses, rows, columns = upstream.shape
+    shape = parts.shape[1:]
+    for worker in nb.prange(workers):
+        mine = parts[worker]
+        for line in range(worker, poses * rows, workers):
+            pose, row = line // rows, line % rows
+            affine = affines[pose]
+            source = affine[:, 3]
+            for column in range(columns):
+                share = step * upstream[pose, row, column]
+                if share != 0.0:
+                    _, _, _, dx, dy, dz = _ray(affine, detector, row, column)
+                    first, last = _bounds(shape, 0.0, step, source, dx, dy, dz)
+                    for k in range(first, last + 1):
+                        t = k * step
+                        x, y, z = source[0] + t * dx, source[1] + t * dy, source[2] + t * dz
+                        i, j, n = int(x), int(y), int(z)
+                        u, v, w = x - i, y - j, z - n
+                        for corner in range(8):
+                            p, q, r = corner & 1, (corner >> 1) & 1, corner >> 2
+                            portion = (u if p else 1 - u) * (v if q else 1 - v) * (w if r else 1 - w)
+                            mine[n + r, j + q, i + p] += np.float32(share * portion)
+
+
+# What the operator calls ---------------------------------------------------------------------------------------------
+def _detector(camera: Camera) -> Array:
+    return np.array([camera.sdd_mm, *camera.pixel_mm, *camera.principal_point_px])
+
+
+def _padded_affines(affines: Array) -> Array:
+    shifted = np.ascontiguousarray(affines, np.float64).copy()
+    shifted[:, :, 3] += RIM
+    return shifted
+
+
+def _packet_edge(volume: BrickedVolume, affines: Array, camera: Camera) -> int:
+    """Rays along the edge of a packet, such that none strays further than SPREAD voxels from the middle."""
+    linear, source = affines[:, :, :3], affines[:, :, 3]
+    corners = np.stack(np.meshgrid(*[(-1.0, n) for n in volume.shape[::-1]], indexing="ij"), -1).reshape(-1, 3)
+    inverse = np.linalg.inv(linear)
+    farthest = np.linalg.norm(np.einsum("bij,bkj->bki", inverse, corners - source[:, None]), axis=-1).max()
+    voxels_per_mm = np.linalg.norm(linear, ord=2, axis=(1, 2)).max()
+    per_pixel = max(camera.pixel_mm) * farthest / camera.sdd_mm * voxels_per_mm
+    return max(1, min(_MOST_RAYS, 1 + int(SPREAD * math.sqrt(2) / per_pixel)))
+
+
+def add_projection(
+    volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float, image: NDArray[np.float32]
+) -> None:
+    """Add the line integrals of one volume for poses `affines` (B, 3, 4), index from camera mm, to `image` (B, H, W)."""
+    edge = _packet_edge(volume, affines, camera)
+    padded = _padded_affines(affines)
+    _forward(volume.padded, volume.leap, padded, _detector(camera), step_mm, edge, nb.get_num_threads(), image)
+
+
+def pose_gradient(
+    volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float, upstream: NDArray[np.float32]
+) -> Array:
+    """Gradient (B, 3, 4) of Σ upstream · image with respect to `affines`; `upstream` is (B, H, W)."""
+    edge = _packet_edge(volume, affines, camera)
+    workers = nb.get_num_threads()
+    parts = np.zeros((workers, *affines.shape))
+    padded = _padded_affines(affines)
+    _derivative(volume.padded, volume.leap, padded, _detector(camera), step_mm, edge, workers, upstream, parts)
+    return np.asarray(parts.sum(0))
+
+
+def jacobian(
+    volume: BrickedVolume, affines: Array, changes: Array, camera: Camera, step_mm: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Line integrals (B, H, W) and their derivatives (B, H, W, n).
+
+    `changes` (B, n, 3, 4) are the derivatives of `affines` (B, 3, 4) with respect to the n parameters.
+    """
+    edge = _packet_edge(volume, affines, camera)
+    image = np.zeros((len(affines), *camera.shape), np.float32)
+    derivatives = np.zeros((*image.shape, changes.shape[1]), np.float32)
+    _jacobian(
+        volume.padded,
+        volume.leap,
+        _padded_affines(affines),
+        np.ascontiguousarray(changes),
+        _detector(camera),
+        step_mm,
+        edge,
+        nb.get_num_threads(),
+        image,
+        derivatives,
+    )
+    return image, derivatives
+
+
+def volume_gradient(
+    volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float, upstream: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Gradient (Z, Y, X) of Σ upstream · image with respect to the volume's data; `upstream` is (B, H, W)."""
+    workers = nb.get_num_threads()
+    parts = np.zeros((workers, *volume.padded.shape), np.float32)
+    _scatter(_padded_affines(affines), _detector(camera), step_mm, workers, upstream, parts)
+    inside = tuple(slice(RIM, RIM + n) for n in volume.shape)
+    return np.ascontiguousarray(parts.sum(0)[inside])
+

@@ -1,0 +1,38 @@
+"""Rigid transforms, cameras and the C-arm's orbit. Conventions: docs/conventions.md."""
+
+from femoreg_torch.geometry.camera import Camera, centred_camera, project_points
+from femoreg_torch.geometry.carm import CArm, carm_from_dict, load_carm, orbit_angles
+from femoreg_torch.geometry.rigid import (
+    about_point,
+    check_rigid,
+    euler_xyz_deg,
+    exp_se3,
+    exp_so3,
+    invert_rigid,
+    log_se3,
+    log_so3,
+    rigid,
+    rotation_angle,
+    transform_points,
+)
+
+__all__ = [
+    "CArm",
+    "Camera",
+    "about_point",
+    "carm_from_dict",
+    "centred_camera",
+    "check_rigid",
+    "euler_xyz_deg",
+    "exp_se3",
+    "exp_so3",
+    "invert_rigid",
+    "load_carm",
+    "log_se3",
+    "log_so3",
+    "orbit_angles",
+    "project_points",
+    "rigid",
+    "rotation_angle",
+    "transform_points",
+]

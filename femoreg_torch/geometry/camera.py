@@ -1,0 +1,87 @@
+"""The pinhole camera of a flat-panel C-arm. Everything about pixel ↔ mm stands here and nowhere else.
+
+Camera frame: origin at the X-ray source, +x along detector columns, +y along rows, +z towards the detector (as in
+OpenCV), mm. The centre of the first pixel is at (column, row) = (0, 0).
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one detector (or of a window or coarser grid on it)."""
+
+    sdd_mm: float  # source to detector
+    pixel_mm: tuple[float, float]  # row spacing, column spacing
+    shape: tuple[int, int]  # rows, columns
+    principal_point_px: tuple[float, float]  # column, row where the central ray meets the detector
+
+    def __post_init__(self) -> None:
+        if not self.sdd_mm > 0 or not min(self.pixel_mm) > 0 or min(self.shape) < 1:
+            raise InputError(f"camera: source distance, pixel size and shape must be positive, got {self}.")
+
+    def downsampled(self, factor: int) -> "Camera":
+        """The camera of an image averaged over `factor` × `factor` blocks: c' = (c + 0.5) / factor − 0.5.
+
+        Rows and columns that fill no whole block at the far edge are dropped, as the average drops them.
+        """
+        rows, columns = self.shape
+        return replace(
+            self,
+            pixel_mm=(self.pixel_mm[0] * factor, self.pixel_mm[1] * factor),
+            shape=(rows // factor, columns // factor),
+            principal_point_px=(
+                (self.principal_point_px[0] + 0.5) / factor - 0.5,
+                (self.principal_point_px[1] + 0.5) / factor - 0.5,
+            ),
+        )
+
+    def window(self, rows: slice, columns: slice) -> "Camera":
+        """The camera of `image[rows, columns]`; a step in the slices samples every step-th pixel without averaging."""
+        r0, r1, dr = rows.indices(self.shape[0])
+        c0, c1, dc = columns.indices(self.shape[1])
+        if dr < 1 or dc < 1 or r1 <= r0 or c1 <= c0:
+            raise InputError(f"camera: window rows {rows}, columns {columns} is empty on a {self.shape} detector.")
+        return replace(
+            self,
+            pixel_mm=(self.pixel_mm[0] * dr, self.pixel_mm[1] * dc),
+            shape=(len(range(r0, r1, dr)), len(range(c0, c1, dc))),
+            principal_point_px=((self.principal_point_px[0] - c0) / dc, (self.principal_point_px[1] - r0) / dr),
+        )
+
+    def matrix(self, dtype: torch.dtype = torch.float64) -> Tensor:
+        """K (3, 3): pixel (column, row, 1) ∝ K @ point_camera."""
+        fx, fy = self.sdd_mm / self.pixel_mm[1], self.sdd_mm / self.pixel_mm[0]
+        cx, cy = self.principal_point_px
+        return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=dtype)
+
+    def pixel_positions(self, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Pixel centres (rows, columns, 3) in the camera frame, mm."""
+        y = (torch.arange(self.shape[0], dtype=dtype) - self.principal_point_px[1]) * self.pixel_mm[0]
+        x = (torch.arange(self.shape[1], dtype=dtype) - self.principal_point_px[0]) * self.pixel_mm[1]
+        grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+        return torch.stack([grid_x, grid_y, torch.full_like(grid_x, self.sdd_mm)], -1)
+
+
+def centred_camera(sdd_mm: float, pixel_mm: tuple[float, float], shape: tuple[int, int]) -> Camera:
+    """A camera whose central ray meets the middle of the detector, ((W − 1) / 2, (H − 1) / 2)."""
+    return Camera(sdd_mm, pixel_mm, shape, ((shape[1] - 1) / 2, (shape[0] - 1) / 2))
+
+
+def project_points(camera: Camera, points_camera: Tensor) -> Tensor:
+    """Pixel positions (column, row) of points in the camera frame.
+
+    `points_camera` is (..., N, 3) in mm. Returns (..., N, 2) in pixels, centre of the first pixel at (0, 0); points
+    at or behind the source give nan.
+    """
+    z = points_camera[..., 2:]
+    in_front = z > 0
+    xy = points_camera[..., :2] / torch.where(in_front, z, torch.ones_like(z))
+    scale = xy.new_tensor([camera.sdd_mm / camera.pixel_mm[1], camera.sdd_mm / camera.pixel_mm[0]])
+    pixels = xy * scale + xy.new_tensor(camera.principal_point_px)
+    return torch.where(in_front, pixels, torch.full_like(pixels, torch.nan))

@@ -1,0 +1,73 @@
+"""The C-arm: a camera that orbits about an isocentre, and its presets."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.configs import load_preset
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry.camera import Camera, centred_camera
+from femoreg_torch.geometry.rigid import about_point, exp_so3, rigid
+
+
+@dataclass(frozen=True)
+class CArm:
+    """A C-arm: its camera and, in the camera frame, the axis that its orbit turns about."""
+
+    camera: Camera
+    isocentre_mm: tuple[float, float, float]  # in the camera frame; the orbit axis passes through it
+    orbit_axis: tuple[float, float, float]  # unit vector in the camera frame
+
+    def orbit(self, angle_rad: Tensor) -> Tensor:
+        """`moved_camera_from_camera` (..., 4, 4) after the C-arm has turned by `angle_rad` (...) along its orbit.
+
+        A positive angle turns the camera by the right-hand rule about the orbit axis, so that a point that stands
+        still in the room turns by the negative angle in the camera frame.
+        """
+        axis = angle_rad.new_tensor(self.orbit_axis)
+        turn = rigid(exp_so3(-angle_rad[..., None] * axis))
+        return about_point(turn, angle_rad.new_tensor(self.isocentre_mm))
+
+
+def carm_from_dict(settings: dict[str, Any], where: str) -> CArm:
+    """A C-arm from `{sdd_mm, pixel_mm, shape, principal_point_px, isocentre_mm, orbit_axis}`.
+
+    The last three may be left out: centre of the detector, (0, 0, 0.62 · sdd_mm) (the ratio of the Cios Fusion) and +y.
+    Raises `InputError` that names `where` and the key.
+    """
+    known = {"sdd_mm", "pixel_mm", "shape", "principal_point_px", "isocentre_mm", "orbit_axis"}
+    if unknown := sorted(set(settings) - known):
+        raise InputError(f"{where}: unknown key {unknown[0]!r}. Known keys: {', '.join(sorted(known))}.")
+    for key in ("sdd_mm", "pixel_mm", "shape"):
+        if key not in settings:
+            raise InputError(f"{where}: `{key}` is missing. Give at least sdd_mm, pixel_mm and shape.")
+    pair = {key: settings[key] for key in ("pixel_mm", "shape")}
+    for key, value in pair.items():
+        if not isinstance(value, list | tuple) or len(value) != 2:
+            raise InputError(f"{where}.{key}: two numbers [row, column] were expected, got {value!r}.")
+    sdd = float(settings["sdd_mm"])
+    pixel = (float(pair["pixel_mm"][0]), float(pair["pixel_mm"][1]))
+    camera = centred_camera(sdd, pixel, (int(pair["shape"][0]), int(pair["shape"][1])))
+    if "principal_point_px" in settings:
+        column, row = settings["principal_point_px"]
+        camera = replace(camera, principal_point_px=(float(column), float(row)))
+    x, y, z = (float(v) for v in settings.get("isocentre_mm", (0.0, 0.0, 0.62 * sdd)))
+    axis = [float(v) for v in settings.get("orbit_axis", (0.0, 1.0, 0.0))]
+    length = math.sqrt(sum(v * v for v in axis))
+    if not length > 0:
+        raise InputError(f"{where}.orbit_axis: must not be zero.")
+    return CArm(camera, (x, y, z), (axis[0] / length, axis[1] / length, axis[2] / length))
+
+
+def load_carm(name: str) -> CArm:
+    """The C-arm preset `configs/carm/<name>.yaml`. Raises `InputError` with the list of presets if there is none."""
+    return carm_from_dict(load_preset("carm", name), f"C-arm preset {name}")
+
+
+def orbit_angles(half_range_deg: float, step_deg: float) -> Tensor:
+    """Angles (N,) in radians of an exhaustive orbit search, −half_range to +half_range inclusive."""
+    n = round(half_range_deg / step_deg)
+    return torch.arange(-n, n + 1, dtype=torch.float64) * math.radians(step_deg)

@@ -1,0 +1,59 @@
+"""What every optimiser takes and returns."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+from torch import Tensor
+
+Objective = Callable[[Tensor], Tensor]  # deltas (P, n) in units of their scale -> values (P,), lower is better
+
+
+class Stop(Enum):
+    """Why an optimiser stopped, each with a sentence for people."""
+
+    SMALL_STEP = "the step became smaller than its tolerance"
+    FLAT = "the value no longer improves by more than its tolerance"
+    BUDGET = "the evaluations allowed were used up"
+    ROUNDOFF = "rounding errors keep it from improving further"
+
+
+@dataclass(frozen=True)
+class Result:
+    """Outcome of one optimisation.
+
+    `delta` (n,) is in units of the scales. `trace` holds (evaluations so far, best value, best delta) whenever it improved.
+    """
+
+    delta: Tensor
+    value: float
+    stop: Stop
+    evaluations: int
+    trace: tuple[tuple[int, float, tuple[float, ...]], ...]
+
+
+class BestSoFar:
+    """Counts evaluations of an objective and keeps the best point and the trace of improvements."""
+
+    def __init__(self, objective: Objective) -> None:
+        self._objective = objective
+        self.evaluations = 0
+        self.value = float("inf")
+        self.delta: Tensor | None = None
+        self.trace: list[tuple[int, float, tuple[float, ...]]] = []
+
+    def __call__(self, deltas: Tensor) -> Tensor:
+        """Values (P,) of deltas (P, n)."""
+        values = self._objective(deltas)
+        self.evaluations += len(deltas)
+        best = int(values.argmin())
+        if float(values[best]) < self.value:
+            self.value, self.delta = float(values[best]), deltas[best].clone()
+            self.trace.append((self.evaluations, self.value, tuple(self.delta.tolist())))
+        return values
+
+    def result(self, stop: Stop) -> Result:
+        """The best point met so far. Raises `ArithmeticError` if no value was ever finite."""
+        if self.delta is None:
+            raise ArithmeticError("the objective was never finite: nothing to optimise")
+        return Result(self.delta, self.value, stop, self.evaluations, tuple(self.trace))

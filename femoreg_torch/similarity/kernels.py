@@ -1,0 +1,60 @@
+"""Separable derivative kernels shared by every gradient-based similarity."""
+
+import math
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor
+
+
+def derivative_taps(smoothing_px: float) -> tuple[Tensor, Tensor]:
+    """Taps (K,) float64 across and along a derivative: Sobel's [1, 2, 1] / 4 and [−1, 0, 1] / 2, each smoothed.
+
+    `smoothing_px` is the standard deviation of a Gaussian that is folded in (cut at 2 σ, at least one pixel); 0 for none.
+    """
+    average = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64) / 4
+    slope = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64) / 2
+    if smoothing_px == 0:
+        return average, slope
+    reach = max(1, math.ceil(2 * smoothing_px - 0.5))
+    x = torch.arange(-reach, reach + 1, dtype=torch.float64)
+    gauss = torch.exp(-0.5 * (x / smoothing_px) ** 2)
+    gauss = gauss / gauss.sum()
+
+    def fold(taps: Tensor) -> Tensor:
+        return F.conv1d(taps[None, None], gauss.flip(0)[None, None], padding=2 * reach)[0, 0]
+
+    return fold(average), fold(slope)
+
+
+def image_gradients(images: Tensor, smoothing_px: float) -> Tensor:
+    """Derivatives (B, 2, H, W) per pixel, along columns then along rows, of images (B, H, W); edges are replicated."""
+    average, slope = (taps.to(images) for taps in derivative_taps(smoothing_px))
+    reach = len(average) // 2
+    padded = F.pad(images[:, None], (reach, reach, reach, reach), mode="replicate")
+    along_columns = F.conv2d(F.conv2d(padded, slope[None, None, None, :]), average[None, None, :, None])
+    along_rows = F.conv2d(F.conv2d(padded, average[None, None, None, :]), slope[None, None, :, None])
+    return torch.cat([along_columns, along_rows], 1)
+
+
+def patch_sums(maps: Tensor, radius: int) -> Tensor:
+    """Sums over all patches of (2r + 1)² pixels that lie wholly inside maps (..., H, W): (..., H − 2r, W − 2r).
+
+    By cumulative sums in float64, so that the cost does not depend on the radius and flat regions stay exact.
+    """
+    side = 2 * radius + 1
+    total = F.pad(maps.to(torch.float64).cumsum(-1), (1, 0))
+    total = total[..., side:] - total[..., :-side]
+    total = F.pad(total.cumsum(-2), (0, 0, 1, 0))
+    return total[..., side:, :] - total[..., :-side, :]
+
+
+def patch_weights(weights: Tensor | None, shape: tuple[int, int], radius: int) -> Tensor:
+    """Weights (H − 2r, W − 2r) float64 of the patches, summing to one, from pixel weights (H, W) or equal ones.
+
+    A patch weighs what its pixels weigh on average.
+    """
+    if weights is None:
+        weights = torch.ones(shape)
+    sums = patch_sums(weights, radius).clamp(min=0)
+    return sums / sums.sum()

@@ -1,0 +1,50 @@
+"""A volume: numbers on a regular grid in patient space (or, for a device, in CAD space)."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)  # compared and hashed by identity, so that back ends can cache what they derive
+class Volume:
+    """Values `data` (Z, Y, X), indexed [z, y, x], voxel centres at integers.
+
+    `lps_from_index` (4, 4) float64 maps (x, y, z) indices to mm: LPS for a CT, CAD axes for a device.
+    """
+
+    data: Tensor
+    lps_from_index: Tensor
+
+    def __post_init__(self) -> None:
+        if self.data.ndim != 3:
+            raise InputError(f"volume: data must be (Z, Y, X), got shape {tuple(self.data.shape)}.")
+        if self.lps_from_index.shape != (4, 4) or self.lps_from_index.dtype != torch.float64:
+            raise InputError("volume: lps_from_index must be a 4×4 float64 tensor.")
+
+    @property
+    def spacing_mm(self) -> tuple[float, float, float]:
+        """Voxel size along x, y, z."""
+        x, y, z = self.lps_from_index[:3, :3].norm(dim=0).tolist()
+        return x, y, z
+
+    def centre(self) -> Tensor:
+        """Middle of the grid (3,), mm, half-way between the outermost voxel centres."""
+        last = torch.tensor(self.data.shape[::-1], dtype=torch.float64) - 1
+        return self.lps_from_index[:3, :3] @ (last / 2) + self.lps_from_index[:3, 3]
+
+    def with_data(self, data: Tensor) -> "Volume":
+        """Other values on the same grid."""
+        if data.shape != self.data.shape:
+            raise InputError(f"volume: {tuple(data.shape)} values do not fit a {tuple(self.data.shape)} grid.")
+        return Volume(data, self.lps_from_index)
+
+
+def axis_aligned(spacing_mm: tuple[float, float, float], origin_mm: tuple[float, float, float]) -> Tensor:
+    """`lps_from_index` (4, 4) of a grid along the axes; the origin is the centre of the first voxel."""
+    affine = torch.eye(4, dtype=torch.float64)
+    affine[:3, :3] = torch.diag(torch.tensor(spacing_mm, dtype=torch.float64))
+    affine[:3, 3] = torch.tensor(origin_mm, dtype=torch.float64)
+    return affine
