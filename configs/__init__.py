@@ -10,7 +10,9 @@ from femoreg_torch.errors import InputError
 
 def preset_names(group: str) -> list[str]:
     """Names of the presets in `configs/<group>/`, sorted."""
-    return sorted(p.name.removesuffix(".yaml") for p in files(__name__).joinpath(group).iterdir() if p.name.endswith(".yaml"))
+    return sorted(
+        p.name.removesuffix(".yaml") for p in files(__name__).joinpath(group).iterdir() if p.name.endswith(".yaml")
+    )
 
 
 def load_preset(group: str, name: str) -> dict[str, Any]:

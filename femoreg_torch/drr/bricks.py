@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from femoreg_torch.errors import InputError
 from femoreg_torch.volume.grid import Volume
 
 BRICK = 4  # voxels along each edge; the kernels find a brick with a shift by 2
@@ -18,7 +19,7 @@ RIM = 8  # voxels of zeros around the volume: SPREAD twice, plus a brick, so tha
 class BrickedVolume:
     """A volume with a rim of zeros, and for every brick the distance to the nearest one that is not empty.
 
-    `padded` is (Z + 2·RIM, …) rounded up to whole bricks. `leap` counts bricks in the chessboard metric: 0 where a sample
+    `padded` is (Z + 2·RIM, …) rounded up to whole bricks. `leap` counts bricks, chessboard metric: 0 where a sample
     within SPREAD of the brick may be non-zero, n where all bricks closer than n are empty.
     """
 
@@ -32,7 +33,12 @@ _cache: WeakKeyDictionary[Volume, BrickedVolume] = WeakKeyDictionary()
 
 
 def bricked(volume: Volume) -> BrickedVolume:
-    """The bricked form of a volume on the CPU, computed once per volume (and again if its data were changed)."""
+    """The bricked form of a volume on the CPU, computed once per volume (and again if its data were changed).
+
+    Raises `InputError` for data made under `torch.inference_mode`, whose changes cannot be noticed.
+    """
+    if volume.data.is_inference():
+        raise InputError("project: this volume was made under torch.inference_mode. Use torch.no_grad there.")
     known = _cache.get(volume)
     if known is None or known.version != volume.data._version:
         known = _build(volume.data.detach().numpy(), volume.data._version)

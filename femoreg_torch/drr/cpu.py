@@ -1,6 +1,6 @@
 """The projector on the CPU: compiled by numba, all cores, leaping over empty space in packets of rays.
 
-All kernels walk the rays of one volume in the same way. A ray is `source + t · direction` in padded index space, t in mm
+All kernels walk the rays of one volume in the same way. A ray is `source + t · direction` in padded index space, t mm
 from the X-ray source; samples lie at whole multiples of the step, so that neither the batch nor the place of the volume
 moves them. The detector is cut into square packets, small enough that all rays of one stay within SPREAD voxels of its
 middle. The middle ray alone finds the runs of samples that may see something; every ray of the packet then takes them.
@@ -62,7 +62,7 @@ def _bounds(shape, margin, step, source, dx, dy, dz):  # type: ignore[no-untyped
     enter, leave = _clip(source[2], dz, shape[0], margin, enter, leave)
     if leave < enter:
         return 0, -1
-    return int(math.ceil(enter / step + 1e-9)), int(math.floor(leave / step - 1e-9))
+    return math.ceil(enter / step + 1e-9), math.floor(leave / step - 1e-9)
 
 
 @_jit
@@ -149,7 +149,7 @@ def _integral(flat, height, width, first, end, step, source, dx, dy, dz):  # typ
 
 @_jit
 def _moments(flat, height, width, first, end, step, source, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Σ slope (3) and Σ t · slope (3) over a run: all that a derivative with respect to the affine needs; then Σ value."""
+    """Σ slope (3) and Σ t · slope (3) over a run: all that a derivative by the affine needs; then Σ value."""
     base, x0, y0, z0, ax, ay, az = _start(source, first, end, step, dx, dy, dz, height, width)
     row, slab = np.int32(width), np.int32(height * width)
     sx = sy = sz = np.float32(0.0)  # Σ slope
@@ -184,118 +184,133 @@ def _moments(flat, height, width, first, end, step, source, dx, dy, dz):  # type
     return sx, sy, sz, t * sx + step * nx, t * sy + step * ny, t * sz + step * nz, total
 
 
+@_jit
+def _first_packet(principal, edge):  # type: ignore[no-untyped-def]
+    """Row or column, at most 0, where the first packet begins: packets are counted from the principal point.
+
+    A window of the detector is thus cut into the same packets, and renders the same, as the whole.
+    """
+    return -(-math.floor(principal) % edge)
+
+
 # Kernels: poses × packets, shared out among the cores ----------------------------------------------------------------
 @_parallel
-def _forward(padded, leap, affines, detector, step, edge, workers, out):  # type: ignore[no-untyped-def]
+def _forward(padded, leap, affines, detector, step, edges, workers, out):  # type: ignore[no-untyped-def]
     poses, rows, columns = out.shape
     flat = padded.reshape(-1)
     height, width = padded.shape[1], padded.shape[2]
-    bands = -(-rows // edge)
     for worker in nb.prange(workers):
         starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
-        for band in range(worker, poses * bands, workers):
-            pose, top = band // bands, (band % bands) * edge
-            affine, bottom = affines[pose], min(top + edge, rows)
+        for pose in range(poses):
+            affine, edge = affines[pose], edges[pose]
             source = affine[:, 3]
-            for left in range(0, columns, edge):
-                right = min(left + edge, columns)
-                _, _, _, dx, dy, dz = _ray(affine, detector, (top + bottom - 1) / 2, (left + right - 1) / 2)
-                n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
-                if n > 0:
-                    for row in range(top, bottom):
-                        for column in range(left, right):
-                            _, _, _, dx, dy, dz = _ray(affine, detector, row, column)
-                            total = np.float32(0.0)
-                            for i in range(n):
-                                total += _integral(
-                                    flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
-                                )
-                            out[pose, row, column] += np.float32(step) * total
+            first_top, first_left = _first_packet(detector[4], edge), _first_packet(detector[3], edge)
+            bands = -(-(rows - first_top) // edge)
+            for band in range((worker + pose) % workers, bands, workers):
+                top = first_top + band * edge
+                for left in range(first_left, columns, edge):
+                    middle_row, middle_column = top + (edge - 1) / 2, left + (edge - 1) / 2
+                    _, _, _, dx, dy, dz = _ray(affine, detector, middle_row, middle_column)
+                    n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
+                    if n > 0:
+                        for row in range(max(top, 0), min(top + edge, rows)):
+                            for column in range(max(left, 0), min(left + edge, columns)):
+                                _, _, _, dx, dy, dz = _ray(affine, detector, row, column)
+                                total = np.float32(0.0)
+                                for i in range(n):
+                                    total += _integral(
+                                        flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
+                                    )
+                                out[pose, row, column] += np.float32(step) * total
 
 
 @_parallel
-def _derivative(padded, leap, affines, detector, step, edge, workers, upstream, parts):  # type: ignore[no-untyped-def]
+def _derivative(padded, leap, affines, detector, step, edges, workers, upstream, parts):  # type: ignore[no-untyped-def]
     poses, rows, columns = upstream.shape
     flat = padded.reshape(-1)
     height, width = padded.shape[1], padded.shape[2]
-    bands = -(-rows // edge)
     for worker in nb.prange(workers):
         starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
-        for band in range(worker, poses * bands, workers):
-            pose, top = band // bands, (band % bands) * edge
-            affine, bottom = affines[pose], min(top + edge, rows)
+        for pose in range(poses):
+            affine, edge = affines[pose], edges[pose]
             source, mine = affine[:, 3], parts[worker, pose]
-            for left in range(0, columns, edge):
-                right = min(left + edge, columns)
-                _, _, _, dx, dy, dz = _ray(affine, detector, (top + bottom - 1) / 2, (left + right - 1) / 2)
-                n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
-                if n > 0:
-                    for row in range(top, bottom):
-                        for column in range(left, right):
-                            weight = step * upstream[pose, row, column]
-                            if weight != 0.0:
-                                x, y, z, dx, dy, dz = _ray(affine, detector, row, column)
-                                for i in range(n):
-                                    sx, sy, sz, tx, ty, tz, _ = _moments(
-                                        flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
-                                    )
-                                    mine[0, 0] += weight * tx * x
-                                    mine[0, 1] += weight * tx * y
-                                    mine[0, 2] += weight * tx * z
-                                    mine[0, 3] += weight * sx
-                                    mine[1, 0] += weight * ty * x
-                                    mine[1, 1] += weight * ty * y
-                                    mine[1, 2] += weight * ty * z
-                                    mine[1, 3] += weight * sy
-                                    mine[2, 0] += weight * tz * x
-                                    mine[2, 1] += weight * tz * y
-                                    mine[2, 2] += weight * tz * z
-                                    mine[2, 3] += weight * sz
+            first_top, first_left = _first_packet(detector[4], edge), _first_packet(detector[3], edge)
+            bands = -(-(rows - first_top) // edge)
+            for band in range((worker + pose) % workers, bands, workers):
+                top = first_top + band * edge
+                for left in range(first_left, columns, edge):
+                    middle_row, middle_column = top + (edge - 1) / 2, left + (edge - 1) / 2
+                    _, _, _, dx, dy, dz = _ray(affine, detector, middle_row, middle_column)
+                    n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
+                    if n > 0:
+                        for row in range(max(top, 0), min(top + edge, rows)):
+                            for column in range(max(left, 0), min(left + edge, columns)):
+                                weight = step * upstream[pose, row, column]
+                                if weight != 0.0:
+                                    x, y, z, dx, dy, dz = _ray(affine, detector, row, column)
+                                    for i in range(n):
+                                        sx, sy, sz, tx, ty, tz, _ = _moments(
+                                            flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
+                                        )
+                                        mine[0, 0] += weight * tx * x
+                                        mine[0, 1] += weight * tx * y
+                                        mine[0, 2] += weight * tx * z
+                                        mine[0, 3] += weight * sx
+                                        mine[1, 0] += weight * ty * x
+                                        mine[1, 1] += weight * ty * y
+                                        mine[1, 2] += weight * ty * z
+                                        mine[1, 3] += weight * sy
+                                        mine[2, 0] += weight * tz * x
+                                        mine[2, 1] += weight * tz * y
+                                        mine[2, 2] += weight * tz * z
+                                        mine[2, 3] += weight * sz
 
 
 @_parallel
-def _jacobian(padded, leap, affines, changes, detector, step, edge, workers, image, out):  # type: ignore[no-untyped-def]
+def _jacobian(padded, leap, affines, changes, detector, step, edges, workers, image, out):  # type: ignore[no-untyped-def]
     poses, rows, columns, dofs = out.shape
     flat = padded.reshape(-1)
     height, width = padded.shape[1], padded.shape[2]
-    bands = -(-rows // edge)
     for worker in nb.prange(workers):
         starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
-        for band in range(worker, poses * bands, workers):
-            pose, top = band // bands, (band % bands) * edge
-            affine, bottom = affines[pose], min(top + edge, rows)
+        for pose in range(poses):
+            affine, edge = affines[pose], edges[pose]
             source = affine[:, 3]
-            for left in range(0, columns, edge):
-                right = min(left + edge, columns)
-                _, _, _, dx, dy, dz = _ray(affine, detector, (top + bottom - 1) / 2, (left + right - 1) / 2)
-                n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
-                if n > 0:
-                    for row in range(top, bottom):
-                        for column in range(left, right):
-                            x, y, z, dx, dy, dz = _ray(affine, detector, row, column)
-                            sx = sy = sz = tx = ty = tz = total = 0.0
-                            for i in range(n):
-                                ax, ay, az, bx, by, bz, value = _moments(
-                                    flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
-                                )
-                                sx += ax
-                                sy += ay
-                                sz += az
-                                tx += bx
-                                ty += by
-                                tz += bz
-                                total += value
-                            image[pose, row, column] = step * total
-                            for dof in range(dofs):
-                                c = changes[pose, dof]
-                                out[pose, row, column, dof] = step * (
-                                    tx * (c[0, 0] * x + c[0, 1] * y + c[0, 2] * z)
-                                    + ty * (c[1, 0] * x + c[1, 1] * y + c[1, 2] * z)
-                                    + tz * (c[2, 0] * x + c[2, 1] * y + c[2, 2] * z)
-                                    + sx * c[0, 3]
-                                    + sy * c[1, 3]
-                                    + sz * c[2, 3]
-                                )
+            first_top, first_left = _first_packet(detector[4], edge), _first_packet(detector[3], edge)
+            bands = -(-(rows - first_top) // edge)
+            for band in range((worker + pose) % workers, bands, workers):
+                top = first_top + band * edge
+                for left in range(first_left, columns, edge):
+                    middle_row, middle_column = top + (edge - 1) / 2, left + (edge - 1) / 2
+                    _, _, _, dx, dy, dz = _ray(affine, detector, middle_row, middle_column)
+                    n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
+                    if n > 0:
+                        for row in range(max(top, 0), min(top + edge, rows)):
+                            for column in range(max(left, 0), min(left + edge, columns)):
+                                x, y, z, dx, dy, dz = _ray(affine, detector, row, column)
+                                sx = sy = sz = tx = ty = tz = total = 0.0
+                                for i in range(n):
+                                    ax, ay, az, bx, by, bz, value = _moments(
+                                        flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
+                                    )
+                                    sx += ax
+                                    sy += ay
+                                    sz += az
+                                    tx += bx
+                                    ty += by
+                                    tz += bz
+                                    total += value
+                                image[pose, row, column] = step * total
+                                for dof in range(dofs):
+                                    c = changes[pose, dof]
+                                    out[pose, row, column, dof] = step * (
+                                        tx * (c[0, 0] * x + c[0, 1] * y + c[0, 2] * z)
+                                        + ty * (c[1, 0] * x + c[1, 1] * y + c[1, 2] * z)
+                                        + tz * (c[2, 0] * x + c[2, 1] * y + c[2, 2] * z)
+                                        + sx * c[0, 3]
+                                        + sy * c[1, 3]
+                                        + sz * c[2, 3]
+                                    )
 
 
 @_parallel
@@ -335,35 +350,38 @@ def _padded_affines(affines: Array) -> Array:
     return shifted
 
 
-def _packet_edge(volume: BrickedVolume, affines: Array, camera: Camera) -> int:
-    """Rays along the edge of a packet, such that none strays further than SPREAD voxels from the middle."""
+def _packet_edges(volume: BrickedVolume, affines: Array, camera: Camera) -> NDArray[np.int64]:
+    """Rays (B,) along the edge of a packet, such that none strays further than SPREAD voxels from the middle.
+
+    Each pose has its own, so that it renders the same whatever else is in the batch.
+    """
     linear, source = affines[:, :, :3], affines[:, :, 3]
     corners = np.stack(np.meshgrid(*[(-1.0, n) for n in volume.shape[::-1]], indexing="ij"), -1).reshape(-1, 3)
     inverse = np.linalg.inv(linear)
-    farthest = np.linalg.norm(np.einsum("bij,bkj->bki", inverse, corners - source[:, None]), axis=-1).max()
-    voxels_per_mm = np.linalg.norm(linear, ord=2, axis=(1, 2)).max()
+    farthest = np.linalg.norm(np.einsum("bij,bkj->bki", inverse, corners - source[:, None]), axis=-1).max(-1)
+    voxels_per_mm = np.linalg.norm(linear, ord=2, axis=(1, 2))
     per_pixel = max(camera.pixel_mm) * farthest / camera.sdd_mm * voxels_per_mm
-    return max(1, min(_MOST_RAYS, 1 + int(SPREAD * math.sqrt(2) / per_pixel)))
+    return np.clip(1 + (SPREAD * math.sqrt(2) / per_pixel).astype(np.int64), 1, _MOST_RAYS)
 
 
 def add_projection(
     volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float, image: NDArray[np.float32]
 ) -> None:
-    """Add the line integrals of one volume for poses `affines` (B, 3, 4), index from camera mm, to `image` (B, H, W)."""
-    edge = _packet_edge(volume, affines, camera)
+    """Add to `image` (B, H, W) the line integrals of one volume for `affines` (B, 3, 4), index from camera mm."""
+    edges = _packet_edges(volume, affines, camera)
     padded = _padded_affines(affines)
-    _forward(volume.padded, volume.leap, padded, _detector(camera), step_mm, edge, nb.get_num_threads(), image)
+    _forward(volume.padded, volume.leap, padded, _detector(camera), step_mm, edges, nb.get_num_threads(), image)
 
 
 def pose_gradient(
     volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float, upstream: NDArray[np.float32]
 ) -> Array:
     """Gradient (B, 3, 4) of Σ upstream · image with respect to `affines`; `upstream` is (B, H, W)."""
-    edge = _packet_edge(volume, affines, camera)
+    edges = _packet_edges(volume, affines, camera)
     workers = nb.get_num_threads()
     parts = np.zeros((workers, *affines.shape))
     padded = _padded_affines(affines)
-    _derivative(volume.padded, volume.leap, padded, _detector(camera), step_mm, edge, workers, upstream, parts)
+    _derivative(volume.padded, volume.leap, padded, _detector(camera), step_mm, edges, workers, upstream, parts)
     return np.asarray(parts.sum(0))
 
 
@@ -374,7 +392,7 @@ def jacobian(
 
     `changes` (B, n, 3, 4) are the derivatives of `affines` (B, 3, 4) with respect to the n parameters.
     """
-    edge = _packet_edge(volume, affines, camera)
+    edges = _packet_edges(volume, affines, camera)
     image = np.zeros((len(affines), *camera.shape), np.float32)
     derivatives = np.zeros((*image.shape, changes.shape[1]), np.float32)
     _jacobian(
@@ -384,7 +402,7 @@ def jacobian(
         np.ascontiguousarray(changes),
         _detector(camera),
         step_mm,
-        edge,
+        edges,
         nb.get_num_threads(),
         image,
         derivatives,
@@ -401,4 +419,3 @@ def volume_gradient(
     _scatter(_padded_affines(affines), _detector(camera), step_mm, workers, upstream, parts)
     inside = tuple(slice(RIM, RIM + n) for n in volume.shape)
     return np.ascontiguousarray(parts.sum(0)[inside])
-

@@ -30,9 +30,9 @@ def project(
     Values are interpolated trilinearly, are zero outside, and are summed at whole multiples of `step_mm` along each ray
     from the source, times the step. Returns (B, H, W) float32, summed over volumes, or (B, V, H, W) if `separate`.
 
-    Differentiable in `camera_from_volume` and in the volumes' data. On the CPU a compiled kernel that skips empty space does
-    the work; on other devices the plain-torch reference does. A sub-window or a coarser grid is a matter of the camera
-    (`Camera.window`, `Camera.downsampled`). Raises `InputError` where the shapes do not fit.
+    Differentiable in `camera_from_volume` and in the volumes' data. On the CPU a compiled kernel that skips empty space
+    does the work; on other devices the plain-torch reference does. A sub-window or a coarser grid is a matter of the
+    camera (`Camera.window`, `Camera.downsampled`). Raises `InputError` where the shapes do not fit.
     """
     _check(volumes, camera_from_volume)
     images = [

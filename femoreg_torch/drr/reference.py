@@ -27,7 +27,7 @@ def trilinear(data: Tensor, points: Tensor) -> Tensor:
 
 
 def march(data: Tensor, index_from_camera: Tensor, camera: Camera, step_mm: float) -> Tensor:
-    """Line integrals (B, H, W) through `data` (Z, Y, X), Σ value · step, samples at whole multiples of the step.
+    """Line integrals (B, H, W) through `data` (Z, Y, X), Σ value · step at the 1st, 2nd, … step from the source.
 
     `index_from_camera` is (B, 4, 4) and maps mm in the camera frame to (x, y, z) indices. Distances are counted along
     each ray from the source, so that the samples of a ray do not depend on where the volume lies.
@@ -45,7 +45,7 @@ def march(data: Tensor, index_from_camera: Tensor, camera: Camera, step_mm: floa
             enter = to_faces.nan_to_num(-torch.inf).amin(-2).amax(-1)
             leave = to_faces.nan_to_num(torch.inf).amax(-2).amin(-1)
             hit = (leave > enter) & (leave > 0)
-            first = int((enter[hit].clamp(min=0) / step_mm).floor().min()) if hit.any() else 0
+            first = max(1, int((enter[hit] / step_mm).floor().min())) if hit.any() else 1
             final = int((leave[hit] / step_mm).ceil().max()) if hit.any() else -1
         total = torch.zeros(camera.shape, dtype=dtype, device=device)
         for k in range(first, final + 1):

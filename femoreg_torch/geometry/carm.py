@@ -44,22 +44,28 @@ def carm_from_dict(settings: dict[str, Any], where: str) -> CArm:
     for key in ("sdd_mm", "pixel_mm", "shape"):
         if key not in settings:
             raise InputError(f"{where}: `{key}` is missing. Give at least sdd_mm, pixel_mm and shape.")
-    pair = {key: settings[key] for key in ("pixel_mm", "shape")}
-    for key, value in pair.items():
-        if not isinstance(value, list | tuple) or len(value) != 2:
-            raise InputError(f"{where}.{key}: two numbers [row, column] were expected, got {value!r}.")
-    sdd = float(settings["sdd_mm"])
-    pixel = (float(pair["pixel_mm"][0]), float(pair["pixel_mm"][1]))
-    camera = centred_camera(sdd, pixel, (int(pair["shape"][0]), int(pair["shape"][1])))
+    (sdd,) = _numbers(settings["sdd_mm"], 1, f"{where}.sdd_mm")
+    row_mm, column_mm = _numbers(settings["pixel_mm"], 2, f"{where}.pixel_mm")
+    rows, columns = _numbers(settings["shape"], 2, f"{where}.shape")
+    camera = centred_camera(sdd, (row_mm, column_mm), (int(rows), int(columns)))
     if "principal_point_px" in settings:
-        column, row = settings["principal_point_px"]
-        camera = replace(camera, principal_point_px=(float(column), float(row)))
-    x, y, z = (float(v) for v in settings.get("isocentre_mm", (0.0, 0.0, 0.62 * sdd)))
-    axis = [float(v) for v in settings.get("orbit_axis", (0.0, 1.0, 0.0))]
+        column, row = _numbers(settings["principal_point_px"], 2, f"{where}.principal_point_px")
+        camera = replace(camera, principal_point_px=(column, row))
+    x, y, z = _numbers(settings.get("isocentre_mm", (0.0, 0.0, 0.62 * sdd)), 3, f"{where}.isocentre_mm")
+    axis = _numbers(settings.get("orbit_axis", (0.0, 1.0, 0.0)), 3, f"{where}.orbit_axis")
     length = math.sqrt(sum(v * v for v in axis))
     if not length > 0:
         raise InputError(f"{where}.orbit_axis: must not be zero.")
     return CArm(camera, (x, y, z), (axis[0] / length, axis[1] / length, axis[2] / length))
+
+
+def _numbers(value: Any, count: int, where: str) -> list[float]:
+    """`value` as `count` numbers; a single number may stand alone. Raises `InputError` that names `where`."""
+    values = value if isinstance(value, list | tuple) else [value]
+    if len(values) != count or not all(isinstance(v, int | float) and math.isfinite(v) for v in values):
+        expected = "one number was" if count == 1 else f"{count} numbers were"
+        raise InputError(f"{where}: {expected} expected, got {value!r}.")
+    return [float(v) for v in values]
 
 
 def load_carm(name: str) -> CArm:

@@ -83,7 +83,9 @@ def rigid(rotation: Tensor | None = None, translation: Tensor | None = None) -> 
     if rotation is None:
         if translation is None:
             return torch.eye(4, dtype=torch.float64)
-        rotation = torch.eye(3, dtype=translation.dtype, device=translation.device).expand(*translation.shape[:-1], 3, 3)
+        rotation = torch.eye(3, dtype=translation.dtype, device=translation.device).expand(
+            *translation.shape[:-1], 3, 3
+        )
     if translation is None:
         translation = rotation.new_zeros(rotation.shape[:-1])
     shape = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
@@ -128,7 +130,7 @@ def transform_points(b_from_a: Tensor, points_a: Tensor) -> Tensor:
 
 
 def about_point(transform: Tensor, centre: Tensor) -> Tensor:
-    """The transform (..., 4, 4) applied with `centre` (..., 3) as its origin: translate(c) · transform · translate(−c)."""
+    """The transform (..., 4, 4) applied with `centre` (..., 3) as origin: translate(c) · transform · translate(−c)."""
     rotation, shift = transform[..., :3, :3], transform[..., :3, 3]
     moved = (rotation @ centre[..., None]).squeeze(-1)
     return rigid(rotation, shift + centre - moved)

@@ -19,7 +19,7 @@ class Bobyqa:
 
     max_evaluations: int = 300
     first_step: float = 0.25
-    tol_x: float = 1e-3
+    tol_x: float = 1e-4
 
 
 def minimise_bobyqa(objective: Objective, n: int, settings: Bobyqa) -> Result:

@@ -22,7 +22,7 @@ class Stop(Enum):
 class Result:
     """Outcome of one optimisation.
 
-    `delta` (n,) is in units of the scales. `trace` holds (evaluations so far, best value, best delta) whenever it improved.
+    `delta` (n,) is in units of the scales. `trace` holds (evaluations, best value, best delta) at every improvement.
     """
 
     delta: Tensor

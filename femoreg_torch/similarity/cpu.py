@@ -180,7 +180,7 @@ def grad_ncc(images, fixed, mean, scale, weights, radius, floor, average, slope)
 def grad_ncc_gradient(  # type: ignore[no-untyped-def]
     images, fixed, mean, scale, weights, radius, floor, average, slope, upstream
 ):
-    """Gradient (B, H, W) of Σ_b upstream_b · Σ weight · NCC / 2 over both derivative maps with respect to the images."""
+    """Gradient (B, H, W) of Σ_b upstream_b · Σ weight · NCC / 2 over both derivative maps by the images."""
     count, height, width = images.shape
     side = 2 * radius + 1
     out = np.zeros((count, height, width), np.float32)

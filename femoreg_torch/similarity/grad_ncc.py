@@ -28,7 +28,9 @@ class GradNcc:
     def __call__(self, images: Tensor) -> Tensor:
         """Costs (B,) in [0, 2] of images (B, H, W), float64: mean over patches and both derivatives of 1 − NCC."""
         if images.shape[1:] != self.fixed.shape[1:]:
-            raise InputError(f"similarity: images are {tuple(images.shape[1:])}, the fixed one {tuple(self.fixed.shape[1:])}.")
+            raise InputError(
+                f"similarity: images are {tuple(images.shape[1:])}, the fixed one {tuple(self.fixed.shape[1:])}."
+            )
         if images.device.type == "cpu" and images.dtype == torch.float32:
             value: Tensor = _CpuGradNcc.apply(images, self)
         else:
@@ -51,10 +53,10 @@ class GradNcc:
 def grad_ncc(fixed: Tensor, radius: int, smoothing_px: float = 1.1, weights: Tensor | None = None) -> GradNcc:
     """Patch Grad-NCC against the fixed image (H, W), as a function of moving images (B, H, W).
 
-    Both images are smoothed by a Gaussian of `smoothing_px` and differentiated by Sobel; NCC is taken over every patch of
-    (2 · radius + 1)² pixels that lies wholly inside, and averaged, weighted by `weights` (H, W) if given. A patch that is
-    flat in either image has NCC 0. xReg: xregImgSimMetric2DPatchGradNCC (smoothing 1.1 px is its 5 × 5 kernel); Grupp et
-    al., IEEE TBME 67 (2020) 441. Raises `InputError` if no patch fits or all weights are zero.
+    Both images are smoothed by a Gaussian of `smoothing_px` and differentiated by Sobel; NCC is taken over every
+    patch of (2 · radius + 1)² pixels that lies wholly inside, and averaged, weighted by `weights` (H, W) if given. A
+    patch that is flat in either image has NCC 0. xReg: xregImgSimMetric2DPatchGradNCC (smoothing 1.1 px is its 5 × 5
+    kernel); Grupp et al., IEEE TBME 67 (2020) 441. Raises `InputError` if no patch fits or all weights are zero.
     """
     height, width = fixed.shape
     if min(height, width) < 2 * radius + 1:

@@ -3,14 +3,14 @@
 import math
 
 import torch
-import torch.nn.functional as F  # noqa: N812
+import torch.nn.functional as F
 from torch import Tensor
 
 
 def derivative_taps(smoothing_px: float) -> tuple[Tensor, Tensor]:
     """Taps (K,) float64 across and along a derivative: Sobel's [1, 2, 1] / 4 and [−1, 0, 1] / 2, each smoothed.
 
-    `smoothing_px` is the standard deviation of a Gaussian that is folded in (cut at 2 σ, at least one pixel); 0 for none.
+    `smoothing_px` is the standard deviation of a Gaussian that is folded in (cut at 2 σ, at least 1 px); 0 for none.
     """
     average = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64) / 4
     slope = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64) / 2

@@ -1,0 +1,30 @@
+# `make demo` and `make test` start from a bare clone: they need Python 3.11+, make and a network to the package index.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: setup demo test lint bench bench-gpu
+
+setup: .venv/.installed
+
+# done again only when the dependencies changed
+.venv/.installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --editable '.[dev]' --constraint constraints.txt
+	touch $@
+
+demo: setup
+	$(BIN)/femoreg demo --out out/demo
+
+test: setup
+	$(BIN)/python -m pytest
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: setup
+	$(BIN)/python benchmarks/drr.py
+
+bench-gpu: setup
+	$(BIN)/python benchmarks/drr.py --device cuda

@@ -1,0 +1,105 @@
+"""This project's projector and its peers behind one call: poses (B, 4, 4) → line integrals (B, H, W).
+
+All take the same volume, camera and `camera_from_volume`, and are differentiable in the poses.
+"""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.drr import project
+from femoreg_torch.geometry import Camera
+from femoreg_torch.volume.grid import Volume
+
+Render = Callable[[Tensor], Tensor]
+
+
+def unit_rays(camera: Camera) -> Tensor:
+    ray = camera.pixel_positions()
+    return ray / ray.norm(dim=-1, keepdim=True)
+
+
+def chords(volume: Volume, camera: Camera, camera_from_volume: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances (N,) in mm at which the rays that meet the volume's box enter and leave it, for one pose."""
+    index_from_camera = torch.linalg.inv(camera_from_volume @ volume.lps_from_index)
+    direction, source = unit_rays(camera) @ index_from_camera[:3, :3].T, index_from_camera[:3, 3]
+    last = torch.tensor(volume.data.shape[::-1], dtype=torch.float64) - 0.5
+    faces = torch.stack([-0.5 - source, last - source], -2) / direction[..., None, :]
+    enter, leave = faces.amin(-2).amax(-1), faces.amax(-2).amin(-1)
+    return enter[leave > enter], leave[leave > enter]
+
+
+def femoreg(volume: Volume, camera: Camera, device: str, step_mm: float) -> tuple[str, Render]:
+    """This project."""
+    posed = Volume(volume.data.to(device), volume.lps_from_index)
+    return "FemoReg Torch", lambda poses: project([posed], poses[:, None].to(device), camera, step_mm)
+
+
+def nanodrr(volume: Volume, camera: Camera, device: str, step_mm: float | None) -> tuple[str, Render]:
+    """nanodrr, default back end; samples so that they lie `step_mm` apart in the volume on average, or its default."""
+    from nanodrr.data import Subject
+    from nanodrr.drr import render
+
+    values = volume.data[None, None].to(device)
+    affine = volume.lps_from_index
+    subject = Subject(
+        values,
+        torch.zeros_like(values),
+        affine.float(),
+        torch.linalg.inv(affine).float(),
+        Subject._make_voxel_to_grid(values.shape),
+        volume.centre().float(),
+        convert_to_mu=False,
+    ).to(device)
+    matrix = camera.matrix()
+    matrix[:2, 2] += 0.5  # its pixel centres lie at + 0.5
+    inverse = torch.linalg.inv(matrix).float().to(device)
+
+    def samples(pose: Tensor) -> int:
+        enter, leave = chords(volume, camera, pose)
+        return max(2, round((leave - enter).mean().item() / step_mm)) if step_mm else 500
+
+    def image(poses: Tensor) -> Tensor:
+        count = len(poses)
+        volume_from_camera = torch.linalg.inv(poses.double()).float().to(device)
+        sdd = torch.full((count,), camera.sdd_mm, device=device)
+        intrinsics = inverse.expand(count, -1, -1)
+        n = samples(poses[0].detach().cpu().double())
+        return render(subject, intrinsics, volume_from_camera, sdd, *camera.shape, n_samples=n)[:, 0]
+
+    return f"nanodrr, {f'{step_mm:g} mm steps' if step_mm else 'its default of 500 samples'}", image
+
+
+def diffdrr(volume: Volume, camera: Camera, device: str, step_mm: float | None) -> tuple[str, Render]:
+    """DiffDRR's renderers, given rays in voxel coordinates: trilinear at `step_mm`, or Siddon if that is None."""
+    from diffdrr.renderers import Siddon, Trilinear
+
+    data = volume.data.permute(2, 1, 0).contiguous().to(device)  # it indexes [x, y, z]
+    index_from_volume = torch.linalg.inv(volume.lps_from_index)
+    pixels = camera.pixel_positions().reshape(1, -1, 3)
+    lengths = pixels.norm(dim=-1).float()[:, None].to(device)
+    renderer = Trilinear() if step_mm else Siddon()
+
+    def image(poses: Tensor) -> Tensor:
+        index_from_camera = index_from_volume @ torch.linalg.inv(poses.double())
+        source = index_from_camera[:, None, :3, 3].float().to(device)
+        target = (pixels @ index_from_camera[:, :3, :3].mT + index_from_camera[:, None, :3, 3]).float().to(device)
+        settings = {}
+        if step_mm:
+            enter, leave = chords(volume, camera, poses[0].detach().cpu().double())
+            settings["n_points"] = math.ceil((leave.max() - enter.min()).item() / step_mm)
+        flat = renderer(data, source, target, lengths.expand(len(poses), -1, -1), **settings)
+        return flat.reshape(len(poses), *camera.shape)
+
+    return f"DiffDRR, {f'trilinear, {step_mm:g} mm steps' if step_mm else 'siddon'}", image
+
+
+RENDERERS = {
+    "femoreg": (None, lambda *scene: femoreg(*scene, 1.0)),
+    "nanodrr": ("nanodrr", lambda *scene: nanodrr(*scene, 1.0)),
+    "nanodrr-default": ("nanodrr", lambda *scene: nanodrr(*scene, None)),
+    "diffdrr-trilinear": ("diffdrr", lambda *scene: diffdrr(*scene, 1.0)),
+    "diffdrr-siddon": ("diffdrr", lambda *scene: diffdrr(*scene, None)),
+}

@@ -1,0 +1,103 @@
+"""Reading fields of a YAML or JSON mapping with errors that name file, key, what was found and what was expected."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import check_rigid
+
+
+@dataclass(frozen=True)
+class Fields:
+    """A mapping and where it stands: the file, and the keys that lead to it."""
+
+    content: dict[str, Any]
+    file: str
+    path: str = ""
+
+    def where(self, key: str) -> str:
+        """`file, path.to.key`, the beginning of every message."""
+        return f"{self.file}, {self.path}.{key}" if self.path else f"{self.file}, {key}"
+
+    def only(self, *known: str) -> "Fields":
+        """Itself, if no key stands in it that is not `known`."""
+        for key in self.content:
+            if key not in known:
+                raise InputError(f"{self.where(str(key))}: unknown key. Known keys here: {', '.join(known)}.")
+        return self
+
+    def __contains__(self, key: str) -> bool:
+        return self.content.get(key) is not None
+
+    def value(self, key: str, expected: str) -> Any:
+        """What stands under `key`; `expected` says in words what should."""
+        if key not in self:
+            raise InputError(f"{self.where(key)}: is missing, {expected} was expected.")
+        return self.content[key]
+
+    def mapping(self, key: str) -> "Fields":
+        """The mapping under `key`."""
+        value = self.value(key, "a mapping")
+        if not isinstance(value, dict):
+            raise InputError(f"{self.where(key)}: a mapping of keys and values was expected, found {value!r}.")
+        return Fields(value, self.file, f"{self.path}.{key}" if self.path else key)
+
+    def mappings(self, key: str) -> list["Fields"]:
+        """The list of mappings under `key`."""
+        value = self.value(key, "a list")
+        if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+            raise InputError(f"{self.where(key)}: a list of mappings was expected, found {value!r}.")
+        prefix = f"{self.path}.{key}" if self.path else key
+        return [Fields(item, self.file, f"{prefix}[{n}]") for n, item in enumerate(value)]
+
+    def choice(self, key: str, allowed: Sequence[str]) -> str:
+        """One of the `allowed` words under `key`."""
+        value = self.value(key, " or ".join(allowed))
+        if value not in allowed:
+            raise InputError(f"{self.where(key)}: {' or '.join(allowed)} was expected, found {value!r}.")
+        return value
+
+    def number(self, key: str) -> float:
+        """The finite number under `key`."""
+        return self._numbers(key, (), "a number").item()
+
+    def point(self, key: str) -> Tensor:
+        """The point (3,), float64, under `key`."""
+        return self._numbers(key, (3,), "a point [x, y, z] in mm")
+
+    def transform(self, key: str) -> Tensor:
+        """The rigid 4×4 transform, float64, under `key`."""
+        return check_rigid(self._numbers(key, (4, 4), "a 4×4 matrix"), self.where(key))
+
+    def transforms(self, key: str) -> Tensor:
+        """The list of rigid transforms under `key` as (V, 4, 4), float64."""
+        value = self.value(key, "a list of 4×4 matrices")
+        if not isinstance(value, list) or not value:
+            raise InputError(f"{self.where(key)}: a list of 4×4 matrices was expected, found {value!r}.")
+        items = Fields({f"{key}[{n}]": item for n, item in enumerate(value)}, self.file, self.path)
+        return torch.stack([items.transform(name) for name in items.content])
+
+    def file_path(self, key: str, folder: Path, may_be_folder: bool = False) -> Path:
+        """The existing file under `key`, relative to `folder` unless absolute."""
+        value = self.value(key, "the path of a file")
+        if not isinstance(value, str):
+            raise InputError(f"{self.where(key)}: the path of a file was expected, found {value!r}.")
+        path = folder / value
+        if not (path.is_file() or (may_be_folder and path.is_dir())):
+            raise InputError(f"{self.where(key)}: there is no file {path}. Paths are relative to {self.file}.")
+        return path
+
+    def _numbers(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:
+        value = self.value(key, expected)
+        try:
+            numbers = torch.tensor(value, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError):
+            numbers = torch.empty(0)
+        if isinstance(value, bool) or numbers.shape != shape or not torch.isfinite(numbers).all():
+            raise InputError(f"{self.where(key)}: {expected} was expected, found {value!r}.")
+        return numbers

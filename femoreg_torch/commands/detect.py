@@ -1,0 +1,51 @@
+"""The command `femoreg detect`."""
+
+from pathlib import Path
+from typing import Literal
+
+
+def detect(
+    images: list[Path],
+    *,
+    out: Path,
+    carm: str = "cios_fusion",
+    intensity: Literal["raw", "log"] = "raw",
+    weights: Path | None = None,
+) -> None:
+    """Find the 14 hip landmarks and the bones in fluoroscopic images.
+
+    Writes into OUT: landmarks.csv with the columns image, landmark, column_px, row_px, confidence, visible; and for
+    each image a picture, and its visible landmarks as 3D Slicer markups (x = column, y = row, as for pixels of 1 mm).
+    Patient left is expected on the right; an image that stands on its head is noticed.
+
+    Args:
+        images: fluoroscopic images: DICOM, PNG, TIFF, NIfTI, MHA or NRRD.
+        out: folder of the results.
+        carm: C-arm preset that the images come from.
+        intensity: raw (bone dark) or log (attenuation, bone bright).
+        weights: network weights (safetensors); by default the shipped ones.
+    """
+    from rich.console import Console
+
+    from femoreg_torch.detect import detect as find
+    from femoreg_torch.detect import load_network
+    from femoreg_torch.detect.writing import write_detections
+    from femoreg_torch.errors import InputError
+    from femoreg_torch.fluoro import attenuation_image, check_matches, read_image
+    from femoreg_torch.geometry import load_carm
+
+    repeated = {path.stem for path in images if sum(path.stem == other.stem for other in images) > 1}
+    if repeated:
+        raise InputError(f"images: the name {min(repeated)} stands there twice. Rename one, results go by this name.")
+    camera = load_carm(carm).camera
+    network = load_network(weights)
+    stored = [read_image(path) for path in images]
+    for path, image in zip(images, stored, strict=True):
+        check_matches(image, camera, f"{path}:")
+    attenuation = [attenuation_image(image) if intensity == "raw" else image for image in stored]
+    detections = [find(network, image, camera) for image in attenuation]
+    write_detections(out, images, attenuation, detections, camera)
+    console = Console()
+    for path, detection in zip(images, detections, strict=True):
+        turned = ", standing on its head" if detection.turned else ""
+        console.print(f"{path}: {int(detection.visible.sum())} of {len(detection.visible)} landmarks{turned}")

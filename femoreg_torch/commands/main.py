@@ -1,0 +1,136 @@
+"""`femoreg COMMAND …`: finds the commands, parses their arguments, and turns bad input into one line.
+
+A command is a plain typed function that an installed package names in the entry-point group
+`femoreg_torch.commands`; its Google docstring is its help. Parameters without a default that come before a `*` are
+positional (a `list[…]` takes one or more values), all others are options. Only the chosen command is imported.
+"""
+
+import ast
+import inspect
+import sys
+from collections.abc import Callable, Sequence
+from importlib.machinery import PathFinder
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, get_args, get_origin, get_type_hints
+
+import femoreg_torch
+from femoreg_torch.errors import InputError
+
+GROUP = "femoreg_torch.commands"
+_BAD_INPUT, _INTERRUPTED = 2, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `femoreg` with these arguments (those of the process if None) and return its exit status.
+
+    0: done; 2: bad input, told in one line on stderr; 130: interrupted. Whatever else goes wrong is a defect of this
+    program and keeps its traceback.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    commands = {command.name: command for command in entry_points(group=GROUP)}
+    try:
+        if not arguments or arguments[0] in ("-h", "--help"):
+            print(_overview(commands))
+        elif arguments[0] == "--version":
+            print(f"femoreg {femoreg_torch.__version__}")
+        elif arguments[0] in commands:
+            _run(commands[arguments[0]], arguments[1:])
+        else:
+            raise InputError(f"no command {arguments[0]!r}; there are: {', '.join(commands)}.")
+    except InputError as error:
+        return _complain(str(error))
+    except OSError as error:
+        if error.filename is None:
+            raise
+        return _complain(f"{error.filename}: {error.strerror}.")
+    except KeyboardInterrupt:
+        _complain("interrupted.")
+        return _INTERRUPTED
+    return 0
+
+
+def _complain(message: str) -> int:
+    print(f"femoreg: {' '.join(message.split())}", file=sys.stderr)
+    return _BAD_INPUT
+
+
+def _overview(commands: dict[str, EntryPoint]) -> str:
+    width = max((len(name) for name in commands), default=0)
+    lines = [f"  {name:{width}}  {_summary(command)}" for name, command in commands.items()]
+    return "\n".join(
+        [
+            "usage: femoreg COMMAND …",
+            "",
+            femoreg_torch.__doc__ or "",
+            "",
+            "commands:",
+            *lines,
+            "",
+            "`femoreg COMMAND --help` explains one; `femoreg --version` prints the version.",
+        ]
+    )
+
+
+def _summary(command: EntryPoint) -> str:
+    """First line of the command's docstring, from its source, since importing all commands would take seconds."""
+    package, *rest = command.module.split(".")
+    spec = find_spec(package)
+    for name in rest:
+        found = spec.submodule_search_locations if spec else None
+        spec = PathFinder.find_spec(name, found) if found else None
+    if spec is None or spec.origin is None:
+        return "(not installed here)"
+    for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef) and node.name == command.attr:
+            return (ast.get_docstring(node) or "").partition("\n")[0]
+    return "(not installed here)"
+
+
+def _run(command: EntryPoint, arguments: list[str]) -> None:
+    function = command.load()
+    function(**_parse(function, command.name, arguments))
+
+
+def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dict[str, Any]:
+    """Keyword arguments for `function`. Raises `InputError` for what does not fit its signature."""
+    from docstring_parser import parse as parse_docstring
+    from jsonargparse import ArgumentError, ArgumentParser
+
+    text = parse_docstring(function.__doc__ or "")
+    help_of = {parameter.arg_name: parameter.description for parameter in text.params}
+    parser = ArgumentParser(prog=f"femoreg {name}", description=text.description, exit_on_error=False)
+    hints = get_type_hints(function)
+    if "config" not in hints:
+        parser.add_argument("--config", action="config", help="YAML file with options; the command line overrides it")
+    for parameter in inspect.signature(function).parameters.values():
+        flags, settings = _argument(parameter, hints[parameter.name])
+        parser.add_argument(*flags, **settings, help=help_of.get(parameter.name))
+    try:
+        parsed = parser.parse_args(arguments)
+    except ArgumentError as error:
+        raise InputError(f"{name}: {str(error).rstrip('. ')}. See `femoreg {name} --help`.") from error
+    values = parser.instantiate(parsed)
+    return {key: values[key] for key in hints if key != "return"}
+
+
+def _argument(parameter: inspect.Parameter, hint: Any) -> tuple[list[str], dict[str, Any]]:
+    """Names and settings of a parameter for jsonargparse's `add_argument`."""
+    required = parameter.default is parameter.empty
+    if required and parameter.kind is not parameter.KEYWORD_ONLY:
+        if get_origin(hint) is list:
+            return [parameter.name], {"type": get_args(hint)[0], "nargs": "+"}
+        return [parameter.name], {"type": hint}
+    settings: dict[str, Any] = {"dest": parameter.name}
+    if required:
+        settings |= {"type": hint, "required": True}
+    elif parameter.default is False:
+        settings |= {"action": "store_true"}
+    else:
+        settings |= {"type": hint, "default": parameter.default}
+    return [f"--{parameter.name.replace('_', '-')}"], settings
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,17 @@
+"""Finding bones and landmarks in a fluoroscopic image."""
+
+from femoreg_torch.detect.decode import decode_heatmaps
+from femoreg_torch.detect.grid import image_from_network, network_camera, to_network_grid
+from femoreg_torch.detect.network import Detection, detect, load_network
+from femoreg_torch.detect.normalise import normalise
+
+__all__ = [
+    "Detection",
+    "decode_heatmaps",
+    "detect",
+    "image_from_network",
+    "load_network",
+    "network_camera",
+    "normalise",
+    "to_network_grid",
+]

@@ -1,0 +1,51 @@
+"""A picture of what was detected."""
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from femoreg_torch.detect.network import Detection
+from femoreg_torch.geometry import Camera
+from femoreg_torch.volume import HIP_LANDMARKS
+
+_WIDTH = 768  # pixels of the picture
+_BONE_COLOURS = np.array(  # RGB of background, hip bones, vertebrae, sacrum, femora
+    [[0, 0, 0], [255, 120, 60], [60, 160, 255], [230, 220, 60], [180, 90, 220], [255, 60, 100], [60, 220, 160]],
+    dtype=np.float32,
+)
+_SIDE_COLOURS = {"l": (255, 70, 70), "r": (70, 220, 255)}
+
+
+def draw_overlay(attenuation: Tensor, detection: Detection, camera: Camera) -> NDArray[np.uint8]:
+    """RGB picture (h, 768, 3): image (H, W) in grey, bones tinted, visible landmarks named, left red and right blue."""
+    zoom = _WIDTH / attenuation.shape[1]
+    size = (_WIDTH, round(attenuation.shape[0] * zoom))
+    low, high = (torch.quantile(attenuation.flatten()[::7].float(), q).item() for q in (0.005, 0.995))
+    grey = ((attenuation.float() - low) / max(high - low, 1e-12)).clamp(0, 1).numpy() * 255
+    picture = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)[..., None].repeat(3, 2)
+    labels = _labels_on_picture(detection, camera, zoom, size)
+    tint = np.where(labels[..., None] > 0, 0.25, 0.0)
+    picture = ((1 - tint) * picture + tint * _BONE_COLOURS[labels]).astype(np.uint8)
+    for name, pixel, visible in zip(HIP_LANDMARKS, detection.pixels, detection.visible, strict=True):
+        if visible:
+            column, row = (round(v) for v in ((pixel + 0.5) * zoom - 0.5).tolist())
+            colour = _SIDE_COLOURS[name[-1]]
+            cv2.circle(picture, (column, row), 4, colour, 1, cv2.LINE_AA)
+            cv2.putText(picture, name, (column + 6, row - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+    return picture
+
+
+def _labels_on_picture(detection: Detection, camera: Camera, zoom: float, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """The most probable label of each pixel of the picture, 0 outside of the network's grid."""
+    labels = detection.segmentation.argmax(0).to(torch.uint8).numpy()
+    grid = detection.network_camera
+    # Both images lie on one detector: mm from the principal point, column and row, agree.
+    affine = np.zeros((2, 3))
+    for axis, (pixel_mm, grid_mm) in enumerate(zip(reversed(camera.pixel_mm), reversed(grid.pixel_mm), strict=True)):
+        ratio = pixel_mm / grid_mm
+        affine[axis, axis] = ratio / zoom
+        start = 0.5 / zoom - 0.5 - camera.principal_point_px[axis]
+        affine[axis, 2] = grid.principal_point_px[axis] + ratio * start
+    return cv2.warpAffine(labels, affine, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)

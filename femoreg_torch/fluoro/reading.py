@@ -1,0 +1,109 @@
+"""Reading and writing of fluoroscopic images."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pydicom
+import SimpleITK as sitk  # noqa: N813 (its own documentation's name)
+import torch
+from pydicom.errors import InvalidDicomError
+from pydicom.pixels import apply_rescale
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import temporary_file
+from femoreg_torch.geometry import Camera
+from femoreg_torch.volume.nifti import holds_non_finite
+
+_ITK_SUFFIXES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
+_PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
+
+
+def _read_picture(path: Path) -> np.ndarray:
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+    if image is None:
+        raise InputError(f"{path}: cannot be read as a PNG or TIFF image; the file is damaged or something else.")
+    return image
+
+
+def _read_itk(path: Path) -> np.ndarray:
+    sitk.ProcessObject.SetGlobalWarningDisplay(False)  # the reason of a failure comes with the exception
+    try:
+        image = sitk.ReadImage(str(path))
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[-1].removeprefix("sitk::ERROR: ")
+        raise InputError(f"{path}: cannot be read as NIfTI, MHA or NRRD ({reason}).") from error
+    array = sitk.GetArrayFromImage(image)
+    return array[0] if array.ndim == 3 and array.shape[0] == 1 else array
+
+
+def _read_dicom(path: Path) -> np.ndarray:
+    try:
+        dataset = pydicom.dcmread(path)
+    except InvalidDicomError as error:
+        raise InputError(
+            f"{path}: not a DICOM file, and its name does not end in {', '.join(_PICTURE_SUFFIXES + _ITK_SUFFIXES)}."
+        ) from error
+    frames = int(dataset.get("NumberOfFrames") or 1)
+    if frames > 1:
+        raise InputError(f"{path}: holds {frames} frames, one was expected. Export the frame to be registered.")
+    try:
+        pixels = dataset.pixel_array
+    except (AttributeError, KeyError, NotImplementedError, RuntimeError, ValueError) as error:
+        raise InputError(f"{path}: the DICOM file holds no image that can be decoded ({error}).") from error
+    if dataset.PhotometricInterpretation == "MONOCHROME1":  # low values are shown bright
+        lowest = -(2 ** (dataset.BitsStored - 1)) if dataset.PixelRepresentation else 0
+        pixels = 2 * lowest + 2**dataset.BitsStored - 1 - pixels.astype(np.int64)
+    return apply_rescale(pixels, dataset)
+
+
+def read_image(path: Path) -> Tensor:
+    """A fluoroscopic image (H, W), float32, with the values as stored.
+
+    PNG and TIFF of 8 or 16 bits, NIfTI, MHA or NRRD of one slice, and anything else as a single DICOM frame (rescale
+    applied, MONOCHROME1 inverted so that dark stays dark). Raises `InputError` for a missing or unreadable file, a
+    colour or multi-frame image, values that are not finite, and an image of constant value.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    name = path.name.lower()
+    if name.endswith(_PICTURE_SUFFIXES):
+        array = _read_picture(path)
+    elif name.endswith(_ITK_SUFFIXES):
+        array = _read_itk(path)
+    else:
+        array = _read_dicom(path)
+    if array.ndim == 3 and array.shape[-1] in (3, 4):
+        raise InputError(f"{path}: a colour image, but fluoroscopy has one value per pixel. Export it as greyscale.")
+    if array.ndim != 2:
+        raise InputError(f"{path}: one image was expected, found {' × '.join(str(n) for n in array.shape)} values.")
+    image = torch.from_numpy(array.astype(np.float32))
+    lowest, highest = (v.item() for v in image.aminmax())
+    if not np.isfinite([lowest, highest]).all() or holds_non_finite(path):
+        raise InputError(f"{path}: holds pixels that are not finite (NaN or infinite). Export the image anew.")
+    if lowest == highest:
+        raise InputError(f"{path}: every pixel is {lowest:g}, there is nothing to be seen. Choose another image.")
+    return image
+
+
+def write_image(path: Path, image: Tensor) -> None:
+    """Write a 16-bit grey image (H, W), dtype uint16, as TIFF or PNG by the suffix of `path`."""
+    path = Path(path)
+    if image.dtype != torch.uint16 or image.ndim != 2 or path.suffix.lower() not in _PICTURE_SUFFIXES:
+        raise InputError(f"{path}: a (H, W) uint16 image and a name in {', '.join(_PICTURE_SUFFIXES)} were expected.")
+    with temporary_file(path) as part:
+        if not cv2.imwrite(str(part), image.numpy()):
+            raise OSError(f"{path}: the image could not be written.")
+
+
+def check_matches(image: Tensor, camera: Camera, where: str) -> None:
+    """Raises `InputError` that starts with `where` if the image (H, W) has not the camera's shape."""
+    if tuple(image.shape) != camera.shape:
+        found, expected = " × ".join(str(n) for n in image.shape), " × ".join(str(n) for n in camera.shape)
+        raise InputError(
+            f"{where} is {found} pixels, but the C-arm has {expected}. Export the image uncropped, or give this "
+            "C-arm's own shape under `carm:`."
+        )

@@ -1,0 +1,161 @@
+"""Pose of an object from landmarks in one image, robust against wrong ones.
+
+Hypotheses from small subsets (SQPnP: Terzakis and Lourakis, ECCV 2020), the one with the best consensus (MSAC: Torr and
+Zisserman, CVIU 78, 2000), then a Huber-weighted least-squares refinement of the reprojection error.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+from math import comb
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import Camera, about_point, exp_se3, project_points, transform_points
+
+Array = NDArray[np.float64]
+
+MINIMUM = 4  # points that must agree
+_INLIER_MM = 10.0  # on the detector; twice the mean error of published landmark networks
+_HUBER_MM = 3.0  # on the detector, where the loss turns from square to linear
+_FLOOR_MM = 1.0  # least standard deviation of a landmark that the covariance assumes, on the detector
+_HYPOTHESES = 400
+_SUBSET_SIZES = (4, 5, 6)
+_DEPTHS = (0.2, 1.0)  # of the source-to-detector distance: the object lies between source and detector
+
+
+@dataclass(frozen=True)
+class PnpResult:
+    """A pose and how far to trust it."""
+
+    camera_from_object: Tensor  # (4, 4) float64
+    inliers: Tensor  # (N,) bool: within 10 mm on the detector
+    rms_px: float  # distance of the inliers from their landmarks
+    covariance: Tensor  # (6, 6) of (rotation in rad, translation in mm), camera axes, about the inliers' centroid
+
+
+def solve_pnp(points: Tensor, pixels: Tensor, camera: Camera, weights: Tensor | None = None) -> PnpResult:
+    """Pose of `points` (N, 3) in LPS mm that were seen at `pixels` (N, 2) (column, row) of `camera`.
+
+    `weights` (N,) are positive, for instance the confidences. Only poses are considered that have the points between
+    source and detector and the beam entering from the patient's front, which is the case wherever the image is shown
+    with patient left on the right and head up (or turned by 180°). The result does not depend on chance.
+
+    Raises `InputError` "too few usable landmarks …" when fewer than four, or fewer than half of the points, agree.
+    """
+    weights = torch.ones(len(points)) if weights is None else weights
+    _check(points, pixels, weights)
+    object_points, image_points = (p.to(torch.float64).numpy() for p in (points, pixels))
+    scale = weights.to(torch.float64).numpy()
+    pixel_mm = float(np.mean(camera.pixel_mm))
+    limit_px = _INLIER_MM / pixel_mm
+
+    pose = _consensus(object_points, image_points, scale, camera, limit_px)
+    inliers = np.zeros(len(scale), dtype=bool) if pose is None else _distances(pose, points, pixels, camera) < limit_px
+    for _ in range(3):
+        if pose is None or not _enough(inliers):
+            break
+        pose, covariance = _refine(pose, points[inliers], pixels[inliers], scale[inliers], camera)
+        inliers = _distances(pose, points, pixels, camera) < limit_px
+    if pose is None or not _enough(inliers) or not _plausible(pose.numpy(), object_points, camera):
+        raise InputError(
+            f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree on a pose, but at least {MINIMUM} "
+            "and half of them must. Take a view that shows more of the pelvis, or give the landmarks by hand."
+        )
+    distances = _distances(pose, points, pixels, camera)[inliers]
+    return PnpResult(pose, torch.from_numpy(inliers), float(np.sqrt((distances**2).mean())), covariance)
+
+
+def _check(points: Tensor, pixels: Tensor, weights: Tensor) -> None:
+    count = len(points)
+    if points.shape != (count, 3) or pixels.shape != (count, 2) or weights.shape != (count,):
+        raise InputError(
+            f"solve_pnp: points (N, 3), pixels (N, 2) and weights (N,) were expected, got {tuple(points.shape)}, "
+            f"{tuple(pixels.shape)} and {tuple(weights.shape)}."
+        )
+    if not all(torch.isfinite(values).all() for values in (points, pixels, weights)) or (weights <= 0).any():
+        raise InputError("solve_pnp: points, pixels and weights must be finite, and weights positive.")
+    if count < MINIMUM:
+        raise InputError(
+            f"too few usable landmarks: {count} given, at least {MINIMUM} are needed. "
+            "Take a view that shows more of the pelvis, or give the landmarks by hand."
+        )
+
+
+def _enough(inliers: NDArray[np.bool_]) -> bool:
+    return bool(inliers.sum() >= max(MINIMUM, len(inliers) / 2))
+
+
+def _subsets(count: int) -> list[tuple[int, ...]]:
+    """Index subsets to try: all of the sizes 4 to 6 where there are few, a fixed random choice of them else."""
+    sizes = [size for size in _SUBSET_SIZES if size <= count]
+    if sum(comb(count, size) for size in sizes) <= _HYPOTHESES:
+        return [subset for size in sizes for subset in combinations(range(count), size)]
+    rng = np.random.default_rng(0)
+    return [tuple(rng.choice(count, sizes[n % len(sizes)], replace=False)) for n in range(_HYPOTHESES)]
+
+
+def _plausible(camera_from_object: Array, points: Array, camera: Camera) -> bool:
+    """Whether all points lie between source and detector and the beam runs from the patient's front to the back."""
+    depth = points @ camera_from_object[2, :3] + camera_from_object[2, 3]
+    low, high = (share * camera.sdd_mm for share in _DEPTHS)
+    return bool(depth.min() > low and depth.max() < high and camera_from_object[2, 1] > 0)
+
+
+def _consensus(points: Array, pixels: Array, weights: Array, camera: Camera, limit_px: float) -> Tensor | None:
+    """The hypothesis of least truncated squared error, or None if no subset has a plausible pose."""
+    matrix = camera.matrix().numpy()
+    best, best_cost = None, np.inf
+    for subset in _subsets(len(points)):
+        chosen = list(subset)
+        found, rotations, translations, _ = cv2.solvePnPGeneric(
+            points[chosen], pixels[chosen], matrix, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+        for n in range(found):
+            pose = np.eye(4)
+            pose[:3, :3] = cv2.Rodrigues(rotations[n])[0]
+            pose[:3, 3] = translations[n].ravel()
+            if not _plausible(pose, points, camera):
+                continue
+            projected = points @ pose[:3, :3].T + pose[:3, 3]
+            projected = projected @ matrix.T
+            squared = ((projected[:, :2] / projected[:, 2:] - pixels) ** 2).sum(1)
+            cost = float((weights * np.minimum(squared, limit_px**2)).sum())
+            if cost < best_cost:
+                best, best_cost = pose, cost
+    return None if best is None else torch.from_numpy(best)
+
+
+def _distances(camera_from_object: Tensor, points: Tensor, pixels: Tensor, camera: Camera) -> Array:
+    """Distance (N,) in pixels between projected points and `pixels`; infinite behind the source."""
+    projected = project_points(camera, transform_points(camera_from_object, points.to(torch.float64)))
+    return (projected - pixels).norm(dim=1).nan_to_num(torch.inf).numpy()
+
+
+def _refine(
+    camera_from_object: Tensor, points: Tensor, pixels: Tensor, weights: Array, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """The pose of least Huber loss near `camera_from_object`, and its covariance (6, 6)."""
+    centre = transform_points(camera_from_object, points.to(torch.float64)).mean(0)
+    pixel_mm = float(np.mean(camera.pixel_mm))
+    root = np.sqrt(weights / weights.mean())[:, None]
+
+    def moved(twist: Array) -> Tensor:
+        return about_point(exp_se3(torch.from_numpy(twist)), centre) @ camera_from_object
+
+    def residuals_mm(twist: Array) -> Array:
+        projected = project_points(camera, transform_points(moved(twist), points.to(torch.float64)))
+        return (root * (projected - pixels).numpy() * pixel_mm).ravel()
+
+    solution = least_squares(
+        residuals_mm, np.zeros(6), loss="huber", f_scale=_HUBER_MM, x_scale=[0.01, 0.01, 0.01, 1, 1, 10]
+    )
+    freedom = max(1, len(solution.fun) - 6)
+    variance = max(_FLOOR_MM**2, float((solution.fun**2).sum()) / freedom)
+    normal = solution.jac.T @ solution.jac
+    return moved(solution.x), torch.from_numpy(variance * np.linalg.pinv(normal))

@@ -1,0 +1,83 @@
+"""A workflow as data: the steps that a preset in `configs/registration/` lists."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from jsonargparse import ArgumentError, ArgumentParser
+
+from femoreg_torch.configs import load_preset
+from femoreg_torch.errors import InputError
+from femoreg_torch.optimize import Bobyqa, CmaEs
+from femoreg_torch.registration.objective import Level, Prior
+
+ObjectName = Literal["pelvis", "femur", "device"]
+
+
+@dataclass(frozen=True)
+class BodyPlan:
+    """A body to move: `move` names objects that move together, or is [view] for the C-arm of the view at hand.
+
+    `rotation_deg` and `translation_mm` are per axis of the camera (x along columns, y along rows, z depth): the initial
+    standard deviation for CMA-ES, the half-width of the box for BOBYQA. Zero freezes an axis.
+    """
+
+    move: list[ObjectName | Literal["view"]]
+    centre: ObjectName
+    rotation_deg: list[float]
+    translation_mm: list[float]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One optimisation. `images` says which views take part: the first, each other view by itself, or all together."""
+
+    name: str
+    images: Literal["first", "each other", "all"]
+    kinds: list[Literal["anatomy", "device"]]
+    render: list[ObjectName]
+    bodies: list[BodyPlan]
+    level: Level
+    optimiser: CmaEs | Bobyqa
+    prior: Prior | None = None
+
+
+@dataclass(frozen=True)
+class OrbitSearch:
+    """Exhaustive search of every other view along the C-arm's orbit, from the first view."""
+
+    name: str
+    render: list[ObjectName]
+    half_range_deg: float
+    step_deg: float
+    level: Level
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All steps of a registration, in order. Steps that render the device are left out where a case has none."""
+
+    preset: str
+    steps: tuple[Stage | OrbitSearch, ...]
+
+
+def load_plan(preset: str) -> Plan:
+    """The workflow `configs/registration/<preset>.yaml`. Raises `InputError` that names preset, step and key."""
+    content = load_preset("registration", preset)
+    return Plan(
+        preset,
+        tuple(_step(step, f"registration preset {preset}, step {i + 1}") for i, step in enumerate(content["steps"])),
+    )
+
+
+def _step(content: dict[str, Any], where: str) -> Stage | OrbitSearch:
+    kind = OrbitSearch if "half_range_deg" in content else Stage
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_class_arguments(kind)
+    try:
+        step = kind(**vars(parser.instantiate_classes(parser.parse_object(content))))
+    except (ArgumentError, TypeError) as error:
+        raise InputError(f"{where}: {' '.join(str(error).split())}") from error
+    for body in getattr(step, "bodies", []):
+        if len(body.rotation_deg) != 3 or len(body.translation_mm) != 3:
+            raise InputError(f"{where}: rotation_deg and translation_mm need three numbers, one per camera axis.")
+    return step

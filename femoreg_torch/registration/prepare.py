@@ -1,0 +1,67 @@
+"""From a case on disk to the scene that is registered."""
+
+from torch import Tensor
+
+from femoreg_torch.case import Case, View
+from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import attenuation_image, check_matches, read_image
+from femoreg_torch.registration.scene import Kind, Scene
+from femoreg_torch.volume import (
+    check_inside,
+    label_box_centre,
+    read_ct,
+    read_labels,
+    read_mesh,
+    resample_isotropic,
+    structure_attenuation,
+    voxelise_mesh,
+)
+
+REGISTRATION_SPACING_MM = 1.0  # the paper resamples the CT to 1 mm (section III-A)
+DEVICE_SPACING_MM = 0.5  # a sleeve's wall is thinner than a CT voxel
+
+
+def prepare_scene(case: Case) -> Scene:
+    """Volumes, reference points and images of a case. Raises `InputError` for every input that does not fit."""
+    if not case.views:
+        raise InputError(f"{case.folder}/case.yaml, views: empty. At least one fluoroscopic image is needed.")
+    images = read_images(case)
+    if case.labels_path is None:
+        raise InputError(f"{case.folder}/case.yaml, ct.labels: missing. Give a label map with pelvis and femora.")
+    ct = read_ct(case.ct_path)
+    labels = read_labels(case.labels_path, ct)
+    check_inside(case.landmarks, ct)
+    pelvis_ids, femur_ids = case.structures["pelvis"], case.structures[case.femur]
+    middle = label_box_centre(labels, pelvis_ids)
+    if max(abs(s - REGISTRATION_SPACING_MM) for s in ct.spacing_mm) > 1e-3:
+        labels = resample_isotropic(labels, REGISTRATION_SPACING_MM, nearest=True)
+        ct = resample_isotropic(ct, REGISTRATION_SPACING_MM)
+    volumes = {
+        "pelvis": structure_attenuation(ct, labels, pelvis_ids),
+        "femur": structure_attenuation(ct, labels, femur_ids),
+    }
+    points = {"pelvis": middle, "femur": case.femoral_head}
+    if case.device is not None:
+        volumes["device"] = voxelise_mesh(read_mesh(case.device.model_path), DEVICE_SPACING_MM, case.device.hu)
+        points["device"] = case.device.points["center"]
+    return Scene(case.carm, volumes, points, images)
+
+
+def read_images(case: Case) -> dict[Kind, tuple[Tensor, ...]]:
+    """Attenuation images (H, W) of all views; those with the device only if every view has one."""
+    images: dict[Kind, tuple[Tensor, ...]] = {
+        "anatomy": tuple(_attenuation(case, i, view, "anatomy") for i, view in enumerate(case.views))
+    }
+    if case.device is not None and all(view.device for view in case.views):
+        images["device"] = tuple(_attenuation(case, i, view, "device") for i, view in enumerate(case.views))
+    return images
+
+
+def _attenuation(case: Case, index: int, view: View, kind: Kind) -> Tensor:
+    path = view.anatomy if kind == "anatomy" else view.device
+    if path is None:
+        raise InputError(f"{case.folder}/case.yaml, views[{index}].{kind}: missing.")
+    image = read_image(path)
+    check_matches(image, case.carm.camera, f"{case.folder}/case.yaml, views[{index}].{kind}")
+    return attenuation_image(image) if view.intensity == "raw" else image
+

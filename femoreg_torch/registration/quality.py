@@ -1,0 +1,96 @@
+"""Can a registration be trusted? Asked of every object in every view, without knowing the truth.
+
+Two signs of a wrong pose are measured at the solution. First, what the image gains when the object is drawn: a bone or a
+device that is not where it is drawn explains little of the image. Second, where each view by itself would move the object
+in its own image plane: views that pull in different directions contradict each other, or their common geometry.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from femoreg_torch.geometry import invert_rigid
+from femoreg_torch.registration.objective import Level, image_costs
+from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, reference_point_in_view
+
+_LEVEL = Level(downsample=8, step_mm=1.0, patch_radius=5)
+_PROBE_MM = 0.6  # about half a pixel of the level, at the object
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Beyond these a registration is not trusted."""
+
+    least_gain: float = 0.004  # of mean patch NCC, when the object is drawn
+    most_pull_mm: float = 1.5  # of a single view in its image plane
+
+
+@dataclass(frozen=True)
+class ViewQuality:
+    """One object in one image."""
+
+    view: int  # from 1
+    similarity: float  # mean patch Grad-NCC of the image with all objects drawn, at most 1
+    gain: float  # what drawing this object adds to it
+    pull_mm: tuple[float, float]  # where this view alone would move the object, along its columns and rows
+
+
+@dataclass(frozen=True)
+class ObjectQuality:
+    """One object in all views."""
+
+    views: tuple[ViewQuality, ...]
+    uncertainty_mm: float  # root mean square disagreement of the views in their image planes
+    trusted: bool
+    reason: str
+
+
+def assess(scene: Scene, poses: Poses, limits: Limits) -> dict[str, ObjectQuality]:
+    """Quality of every object placed in `poses`: bones in the anatomy images, the device in the device images."""
+    return {name: _assess_object(scene, poses, name, limits) for name in poses.camera1_from}
+
+
+def _assess_object(scene: Scene, poses: Poses, name: str, limits: Limits) -> ObjectQuality:
+    kind: Kind = "device" if name == "device" else "anatomy"
+    views = tuple(_assess_view(scene, poses, name, kind, view) for view in range(len(scene.images[kind])))
+    pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
+    uncertainty = float(pulls.square().mean().sqrt())
+    reason = _reason(name, views, limits)
+    return ObjectQuality(views, uncertainty, reason is None, reason or "all views agree")
+
+
+def _reason(name: str, views: Sequence[ViewQuality], limits: Limits) -> str | None:
+    for view in views:
+        x, y = view.pull_mm
+        if not torch.isfinite(torch.tensor(view.pull_mm)).all():
+            return f"view {view.view} does not hold the {name}: its similarity has no peak near the solution"
+        if (x * x + y * y) ** 0.5 > limits.most_pull_mm:
+            return f"view {view.view} would move the {name} by ({x:.1f}, {y:.1f}) mm in its image plane"
+        if view.gain < limits.least_gain:
+            return f"drawing the {name} in view {view.view} explains hardly more of the image (gain {view.gain:.4f})"
+    return None
+
+
+def _assess_view(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> ViewQuality:
+    here = poses.camera_from_camera1[view]
+    # The same geometry with this view as the frame that all else is tied to, so that a delta acts along its axes.
+    local = Poses(
+        poses.camera_from_camera1 @ invert_rigid(here), {n: here @ pose for n, pose in poses.camera1_from.items()}
+    )
+    centre = reference_point_in_view(scene, local, name, view)
+    scale = torch.tensor([0, 0, 0, _PROBE_MM, _PROBE_MM, 0], dtype=torch.float64)
+    body = Body((name,), 0, centre, scale)
+    drawn = [n for n in poses.camera1_from if n != "device" or kind == "device"]
+    probes = torch.tensor([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=torch.float64)
+    costs = image_costs(scene, local, (body,), drawn, [(kind, view)], _LEVEL)(probes)[:, 0].tolist()
+    others = [n for n in drawn if n != name]
+    without = image_costs(scene, local, (), others, [(kind, view)], _LEVEL)(torch.zeros(1, 0, dtype=torch.float64))
+    pull = (_minimum(costs[1], costs[0], costs[2]) * _PROBE_MM, _minimum(costs[3], costs[0], costs[4]) * _PROBE_MM)
+    return ViewQuality(view + 1, 1 - costs[0], float(without[0, 0]) - costs[0], pull)
+
+
+def _minimum(before: float, here: float, after: float) -> float:
+    """Where a parabola through three values, one step apart, has its minimum; nan if it has none."""
+    curvature = before - 2 * here + after
+    return (before - after) / (2 * curvature) if curvature > 0 else float("nan")

@@ -1,0 +1,42 @@
+"""One case registered, from its folder to the content of its result."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from femoreg_torch.case import Case
+from femoreg_torch.detect import load_network
+from femoreg_torch.registration.plan import load_plan
+from femoreg_torch.registration.prepare import prepare_scene
+from femoreg_torch.registration.quality import Limits, assess
+from femoreg_torch.registration.report import result_content
+from femoreg_torch.registration.start import start_from_landmarks
+from femoreg_torch.registration.workflow import Report, run_plan
+
+
+def register_case(case: Case, preset: str, seed: int, weights: Path | None, report: Report) -> dict[str, Any]:
+    """Register a case; returns the content of its `result.json` but for the errors against a truth.
+
+    `weights` are those of the landmark network, None for those shipped. Raises `InputError` for input that does not fit.
+    """
+    plan = load_plan(preset)
+    clock = {"began": time.perf_counter()}
+    report("reading CT and images", 0.0)
+    scene = prepare_scene(case)
+    clock["prepared"] = time.perf_counter()
+    report("finding landmarks", 0.0)
+    camera1_from_pelvis, start = start_from_landmarks(case, scene, load_network(weights))
+    clock["started"] = time.perf_counter()
+    camera1_from_device = None if case.device is None else case.device.camera1_from_device
+    outcome = run_plan(scene, plan, camera1_from_pelvis, camera1_from_device, seed, report)
+    clock["registered"] = time.perf_counter()
+    quality = assess(scene, outcome.poses, Limits())
+    done = time.perf_counter()
+    timings = {
+        "reading": clock["prepared"] - clock["began"],
+        "detection": clock["started"] - clock["prepared"],
+        "registration": clock["registered"] - clock["started"],
+        "quality": done - clock["registered"],
+        "total": done - clock["began"],
+    }
+    return result_content(case, outcome, quality, start, timings, preset, seed)

@@ -1,0 +1,49 @@
+"""The start pose: landmarks that the network finds in view 1, and PnP (paper, section II-A)."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from femoreg_torch.case import Case
+from femoreg_torch.detect import Detection, detect
+from femoreg_torch.errors import InputError
+from femoreg_torch.pnp import PnpResult, solve_pnp
+from femoreg_torch.registration.scene import Scene
+from femoreg_torch.volume import HIP_LANDMARKS
+
+
+def start_from_landmarks(case: Case, scene: Scene, network: nn.Module) -> tuple[Tensor, dict[str, Any]]:
+    """`camera1_from_pelvis` (4, 4) from the landmarks detected in view 1, and what is worth keeping of how it came about.
+
+    Raises `InputError` if fewer than four landmarks are of use.
+    """
+    detection = detect(network, scene.images["anatomy"][0], scene.carm.camera)
+    usable = [
+        i for i, name in enumerate(HIP_LANDMARKS) if name in case.landmarks and bool(detection.visible[i])
+    ]
+    if len(usable) < 4:
+        raise InputError(
+            f"{case.views[0].anatomy}: {len(usable)} usable landmarks found, at least 4 are needed. Is this a hip, "
+            "and is `intensity` of the view right (raw: bone dark, log: bone bright)?"
+        )
+    points = torch.stack([case.landmarks[HIP_LANDMARKS[i]] for i in usable])
+    pose = solve_pnp(points, detection.pixels[usable], scene.carm.camera, detection.confidence[usable])
+    return pose.camera_from_object, _summary(detection, pose, usable)
+
+
+def _summary(detection: Detection, pose: PnpResult, usable: list[int]) -> dict[str, Any]:
+    inliers = {HIP_LANDMARKS[i] for i, inlier in zip(usable, pose.inliers.tolist(), strict=True) if inlier}
+    return {
+        "landmarks": {
+            name: {
+                "pixel": detection.pixels[i],
+                "confidence": float(detection.confidence[i]),
+                "visible": bool(detection.visible[i]),
+                "used": name in inliers,
+            }
+            for i, name in enumerate(HIP_LANDMARKS)
+        },
+        "reprojection_rms_px": pose.rms_px,
+        "camera1_from_pelvis": pose.camera_from_object,
+    }

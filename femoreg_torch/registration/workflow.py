@@ -1,0 +1,125 @@
+"""The registration workflow: start pose from landmarks, then the steps of a plan (paper, section II-B)."""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.drr import project
+from femoreg_torch.fluoro import downsample
+from femoreg_torch.geometry import orbit_angles
+from femoreg_torch.optimize import Result, minimise
+from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.plan import BodyPlan, OrbitSearch, Plan, Stage
+from femoreg_torch.registration.scene import (
+    Body,
+    Kind,
+    Poses,
+    Scene,
+    first_view_only,
+    moved,
+    reference_point_in_view,
+)
+from femoreg_torch.similarity import grad_ncc
+
+Report = Callable[[str, float], None]  # what is done, and the share of the plan behind it
+
+
+@dataclass(frozen=True, eq=False)
+class StepTrace:
+    """What one step did: its name, the poses after it, and how its optimisations ran."""
+
+    name: str
+    view: int | None  # the view that a step for each other view was run on
+    poses: Poses
+    result: Result | None  # None for an exhaustive search
+    value: float
+    evaluations: int
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Poses at the end of a plan, and the trace of every step."""
+
+    poses: Poses
+    trace: tuple[StepTrace, ...]
+
+
+def run_plan(
+    scene: Scene, plan: Plan, camera1_from_pelvis: Tensor, camera1_from_device: Tensor | None, seed: int, report: Report
+) -> Outcome:
+    """Run all steps of a plan from a start pose (4, 4) of the pelvis in view 1 and a nominal one of the device.
+
+    The femur starts where the CT has it. Steps that need the device's images are left out where there are none.
+    """
+    start = {"pelvis": camera1_from_pelvis, "femur": camera1_from_pelvis}
+    if camera1_from_device is not None and "device" in scene.images:
+        start["device"] = camera1_from_device
+    poses = first_view_only(start, len(scene.images["anatomy"]))
+    trace: list[StepTrace] = []
+    steps = [step for step in plan.steps if "device" in start or "device" not in step.render]
+    for number, step in enumerate(steps):
+        report(step.name, number / len(steps))
+        for entry in _run_step(scene, poses, step, seed * 1000 + number):
+            trace.append(entry)
+            poses = entry.poses
+    report("done", 1.0)
+    return Outcome(poses, tuple(trace))
+
+
+def _run_step(scene: Scene, poses: Poses, step: Stage | OrbitSearch, seed: int) -> Iterator[StepTrace]:
+    others = range(1, len(scene.images["anatomy"]))
+    if isinstance(step, OrbitSearch):
+        for view in others:
+            entry = search_orbit(scene, poses, step, view)
+            poses = entry.poses
+            yield entry
+    elif step.images == "each other":
+        for view in others:
+            entry = run_stage(scene, poses, step, (view,), seed)
+            poses = entry.poses
+            yield entry
+    else:
+        yield run_stage(scene, poses, step, (0,) if step.images == "first" else (0, *others), seed)
+
+
+def run_stage(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], seed: int) -> StepTrace:
+    """Optimise the bodies of one stage over the given views."""
+    began = time.perf_counter()
+    bodies = tuple(_body(scene, poses, plan, views[0]) for plan in stage.bodies)
+    images: list[tuple[Kind, int]] = [(kind, view) for kind in stage.kinds for view in views]
+    costs = image_costs(scene, poses, bodies, stage.render, images, stage.level)
+    objective = stage_objective(costs, bodies, stage.prior)
+    result = minimise(objective, sum(len(body.free) for body in bodies), stage.optimiser, seed)
+    view = views[0] if stage.images == "each other" else None
+    seconds = time.perf_counter() - began
+    after = moved(poses, bodies, result.delta)
+    return StepTrace(stage.name, view, after, result, result.value, result.evaluations, seconds)
+
+
+def _body(scene: Scene, poses: Poses, plan: BodyPlan, view: int) -> Body:
+    scale = torch.tensor([*plan.rotation_deg, *plan.translation_mm], dtype=torch.float64)
+    scale[:3] *= torch.pi / 180
+    moves_view = "view" in plan.move
+    centre = reference_point_in_view(scene, poses, plan.centre, view if moves_view else 0)
+    if moves_view:
+        return Body((), view, centre, scale)
+    return Body(tuple(name for name in plan.move if name != "view"), 0, centre, scale)
+
+
+def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> StepTrace:
+    """Place the C-arm of one view at the angle of its orbit, from view 1, that fits its image best."""
+    began = time.perf_counter()
+    orbit = scene.carm.orbit(orbit_angles(search.half_range_deg, search.step_deg))  # (N, 4, 4)
+    where = torch.stack([orbit @ poses.camera1_from[name] for name in search.render], 1)  # (N, O, 4, 4)
+    camera = scene.carm.camera.downsampled(search.level.downsample)
+    drawn = project([scene.volumes[name] for name in search.render], where, camera, search.level.step_mm)
+    fixed = downsample(scene.images["anatomy"][view], search.level.downsample)
+    values = grad_ncc(fixed, search.level.patch_radius)(drawn)
+    best = int(values.argmin())
+    after = poses.with_view(view, orbit[best])
+    seconds = time.perf_counter() - began
+    return StepTrace(search.name, view, after, None, float(values[best]), len(orbit), seconds)

@@ -1,0 +1,30 @@
+"""Volumes of the CT and of the device, their attenuation, and the landmarks of the hip."""
+
+from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
+from femoreg_torch.volume.grid import Volume, axis_aligned
+from femoreg_torch.volume.labels import label_box_centre
+from femoreg_torch.volume.landmarks import HIP_LANDMARKS, LANDMARK_STEMS, check_inside, read_landmarks, write_landmarks
+from femoreg_torch.volume.mesh import check_closed, read_mesh, voxelise_mesh
+from femoreg_torch.volume.reading import read_ct, read_labels, write_volume
+from femoreg_torch.volume.resample import crop, resample_isotropic
+
+__all__ = [
+    "HIP_LANDMARKS",
+    "LANDMARK_STEMS",
+    "Volume",
+    "axis_aligned",
+    "check_closed",
+    "check_inside",
+    "crop",
+    "hu_to_attenuation",
+    "label_box_centre",
+    "read_ct",
+    "read_labels",
+    "read_landmarks",
+    "read_mesh",
+    "resample_isotropic",
+    "structure_attenuation",
+    "voxelise_mesh",
+    "write_landmarks",
+    "write_volume",
+]

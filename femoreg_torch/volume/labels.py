@@ -1,0 +1,35 @@
+"""Where the structures of a label map are."""
+
+from collections.abc import Sequence
+
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import transform_points
+from femoreg_torch.volume.grid import Volume
+
+Corner = tuple[int, int, int]  # x, y, z
+
+
+def label_box(labels: Volume, ids: Sequence[int]) -> tuple[Corner, Corner]:
+    """Index bounds (x, y, z) of the voxels with these labels, low inclusive, high exclusive.
+
+    Raises `InputError` if none of the ids occurs.
+    """
+    boxes = ndimage.find_objects(labels.data.numpy())
+    found = [boxes[n - 1] for n in ids if n <= len(boxes) and boxes[n - 1] is not None]
+    if not found:
+        raise InputError(f"label map: no voxel carries any of the labels {list(ids)}. Check `structures` against it.")
+    x, y, z = ((min(box[axis].start for box in found), max(box[axis].stop for box in found)) for axis in (2, 1, 0))
+    return (x[0], y[0], z[0]), (x[1], y[1], z[1])
+
+
+def label_box_centre(labels: Volume, ids: Sequence[int]) -> Tensor:
+    """Middle (3,), mm, of the bounding box of a structure's voxels. For the pelvis this is the paper's centre PC.
+
+    Raises `InputError` if none of the ids occurs.
+    """
+    lo, hi = (torch.tensor(corner, dtype=torch.float64) for corner in label_box(labels, ids))
+    return transform_points(labels.lps_from_index, ((lo + hi - 1) / 2)[None])[0]

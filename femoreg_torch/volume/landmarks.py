@@ -1,0 +1,135 @@
+"""The 14 hip landmarks and the files that hold them. Inside, landmarks are LPS mm, always in the same order."""
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import read_json, write_json
+from femoreg_torch.volume.grid import Volume
+
+LANDMARK_STEMS = ("FH", "GSN", "IOF", "MOF", "SPS", "IPS", "ASIS")
+HIP_LANDMARKS = tuple(f"{stem}-{side}" for stem in LANDMARK_STEMS for side in "lr")
+
+_LPS_FROM = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
+_FCSV_SPACES = {"0": "RAS", "1": "LPS", "RAS": "RAS", "LPS": "LPS"}  # numbers as in 3D Slicer before 4.11
+_FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
+
+
+def _signs(space: Any, where: str) -> tuple[float, float, float]:
+    if space not in _LPS_FROM:
+        raise InputError(f"{where}: the space must be LPS or RAS, found {space!r}.")
+    return _LPS_FROM[space]
+
+
+def _check_unit(unit: Any, where: str) -> None:
+    if unit != "mm":
+        raise InputError(f"{where}: the unit must be mm, found {unit!r}. Convert the points.")
+
+
+def _plain_points(content: dict[str, Any], path: Path) -> tuple[Any, list[tuple[Any, Any]]]:
+    for key in ("space", "unit", "landmarks"):
+        if key not in content:
+            raise InputError(
+                f"{path}: `{key}` is missing. Either 3D Slicer markups were expected or "
+                '{"space": "LPS", "unit": "mm", "landmarks": {"FH-l": [x, y, z], …}}.'
+            )
+    _check_unit(content["unit"], f"{path}, unit")
+    if not isinstance(content["landmarks"], dict):
+        raise InputError(f"{path}, landmarks: an object of names and points was expected.")
+    return content["space"], list(content["landmarks"].items())
+
+
+def _slicer_points(content: dict[str, Any], path: Path) -> tuple[Any, list[tuple[Any, Any]]]:
+    markups = content["markups"]
+    if not isinstance(markups, list) or len(markups) != 1 or not isinstance(markups[0], dict):
+        raise InputError(f"{path}, markups: one list of points was expected.")
+    markup = markups[0]
+    _check_unit(markup.get("coordinateUnits", "mm"), f"{path}, coordinateUnits")
+    points = markup.get("controlPoints")
+    if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
+        raise InputError(f"{path}, controlPoints: a list of points was expected.")
+    placed = (point for point in points if point.get("positionStatus", "defined") == "defined")
+    return markup.get("coordinateSystem"), [(point.get("label"), point.get("position")) for point in placed]
+
+
+def _fcsv_points(path: Path) -> tuple[Any, list[tuple[Any, Any]]]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: cannot be read as an .fcsv file ({error}).") from error
+    comments = (line.lstrip("# ").split("=", 1) for line in lines if line.startswith("#") and "=" in line)
+    header = {key.strip(): value.strip() for key, value in comments}
+    space, columns = header.get("CoordinateSystem"), header.get("columns", _FCSV_COLUMNS).split(",")
+    rows = csv.DictReader((line for line in lines if line.strip() and not line.startswith("#")), fieldnames=columns)
+    return _FCSV_SPACES.get(space or "", space), [(row["label"], [row["x"], row["y"], row["z"]]) for row in rows]
+
+
+def _point(value: Any, where: str) -> Tensor:
+    try:
+        point = torch.tensor([float(v) for v in value], dtype=torch.float64)
+    except (TypeError, ValueError):
+        point = torch.empty(0)
+    if point.shape != (3,) or not torch.isfinite(point).all():
+        raise InputError(f"{where}: three finite numbers [x, y, z] in mm were expected, found {value!r}.")
+    return point
+
+
+def read_landmarks(path: Path) -> dict[str, Tensor]:
+    """Landmarks (3,) float64, LPS mm, in the order of `HIP_LANDMARKS`; a file may hold fewer than 14.
+
+    Formats: `{"space": "LPS", "unit": "mm", "landmarks": {name: [x, y, z]}}`, 3D Slicer markups (`.mrk.json`) and
+    `.fcsv`, each in LPS or RAS as its header says. Raises `InputError` for an unknown or repeated name, another unit or
+    space, or a point that is not three finite numbers.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    if path.suffix.lower() == ".fcsv":
+        space, points = _fcsv_points(path)
+    else:
+        content = read_json(path)
+        space, points = (_slicer_points if "markups" in content else _plain_points)(content, path)
+    signs = torch.tensor(_signs(space, f"{path}, coordinate system"), dtype=torch.float64)
+    found: dict[str, Tensor] = {}
+    for name, value in points:
+        if name not in HIP_LANDMARKS:
+            raise InputError(f"{path}: unknown landmark {name!r}. Known names: {', '.join(HIP_LANDMARKS)}.")
+        if name in found:
+            raise InputError(f"{path}: landmark {name} stands there twice. Keep one.")
+        found[name] = _point(value, f"{path}, {name}") * signs
+    if not found:
+        raise InputError(f"{path}: holds no landmark. Known names: {', '.join(HIP_LANDMARKS)}.")
+    return {name: found[name] for name in HIP_LANDMARKS if name in found}
+
+
+def write_landmarks(path: Path, landmarks: Mapping[str, Tensor]) -> None:
+    """Write landmarks (3,) in LPS mm: 3D Slicer markups where `path` ends in `.mrk.json`, the plain format else."""
+    if Path(path).name.endswith(".mrk.json"):
+        points = [
+            {"id": str(n + 1), "label": name, "position": point, "positionStatus": "defined"}
+            for n, (name, point) in enumerate(landmarks.items())
+        ]
+        markup = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
+        schema = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json"
+        write_json(Path(path), {"@schema": schema + "#", "markups": [markup]})
+    else:
+        write_json(Path(path), {"space": "LPS", "unit": "mm", "landmarks": dict(landmarks)})
+
+
+def check_inside(landmarks: Mapping[str, Tensor], volume: Volume) -> None:
+    """Raises `InputError` for the first landmark (3,) in LPS mm that lies outside the grid of `volume`."""
+    index_from_lps = torch.linalg.inv(volume.lps_from_index)
+    size = torch.tensor(volume.data.shape[::-1], dtype=torch.float64)
+    for name, point in landmarks.items():
+        index = index_from_lps[:3, :3] @ point + index_from_lps[:3, 3]
+        if (index < -0.5).any() or (index > size - 0.5).any():
+            position = ", ".join(f"{v:.1f}" for v in point.tolist())
+            raise InputError(
+                f"landmark {name} at ({position}) mm LPS lies outside the CT. Check for RAS/LPS mix-ups, or that both "
+                "files are of the same scan."
+            )

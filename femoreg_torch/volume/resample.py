@@ -1,0 +1,53 @@
+"""Other grids for the same volume: crops and isotropic resampling, with the affine that belongs to each."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.volume.grid import Volume
+
+
+def crop(volume: Volume, lo_xyz: tuple[int, int, int], hi_xyz: tuple[int, int, int]) -> Volume:
+    """The voxels with `lo_xyz` ≤ (x, y, z) < `hi_xyz`, clipped to the grid. Raises `InputError` if none is left."""
+    lo = [max(0, n) for n in lo_xyz]
+    hi = [min(size, n) for size, n in zip(reversed(volume.data.shape), hi_xyz, strict=True)]
+    if any(a >= b for a, b in zip(lo, hi, strict=True)):
+        raise InputError(
+            f"volume: the crop from {lo_xyz} to {hi_xyz} holds no voxel of a grid {tuple(volume.data.shape)[::-1]}."
+        )
+    affine = volume.lps_from_index.clone()
+    affine[:3, 3] += affine[:3, :3] @ torch.tensor(lo, dtype=torch.float64)
+    return Volume(volume.data[lo[2] : hi[2], lo[1] : hi[1], lo[0] : hi[0]].contiguous(), affine)
+
+
+def _resize(data: Tensor, scale: tuple[float, float, float], nearest: bool) -> Tensor:
+    """`data` (Z, Y, X) with `scale` = new over old number of voxels along x, y, z; outer faces stay where they are."""
+    x, y, z = scale
+    if nearest:
+        return F.interpolate(data[None, None], scale_factor=(z, y, x), mode="nearest-exact")[0, 0]
+    # torch has the anti-aliased linear filter (a triangle as wide as the coarser voxel) in 2-D only; it is separable
+    flat = F.interpolate(data[:, None], scale_factor=(y, x), mode="bilinear", antialias=True)[:, 0]
+    upright = flat.movedim(0, 1)[:, None]  # (Y, 1, Z, X)
+    return (
+        F.interpolate(upright, scale_factor=(z, 1.0), mode="bilinear", antialias=True)[:, 0].movedim(1, 0).contiguous()
+    )
+
+
+def resample_isotropic(volume: Volume, spacing_mm: float, nearest: bool = False) -> Volume:
+    """The volume on cubic voxels of `spacing_mm`, along its own axes.
+
+    The outer face of the first voxel stays in place; a voxel that would reach beyond the far face is left out. Linear
+    interpolation, with averaging where voxels become larger; `nearest` is for label maps.
+    """
+    old = volume.spacing_mm
+    if all(abs(s - spacing_mm) < 1e-6 for s in old):
+        return volume
+    ratio = torch.tensor([spacing_mm / s for s in old], dtype=torch.float64)
+    scale = tuple((s + 1e-9) / spacing_mm for s in old)
+    if any(int(n * s) < 1 for n, s in zip(reversed(volume.data.shape), scale, strict=True)):
+        raise InputError(f"volume: {spacing_mm:g} mm voxels are larger than the whole volume.")
+    affine = volume.lps_from_index.clone()
+    affine[:3, 3] += affine[:3, :3] @ (0.5 * ratio - 0.5)
+    affine[:3, :3] *= ratio
+    return Volume(_resize(volume.data, (scale[0], scale[1], scale[2]), nearest), affine)

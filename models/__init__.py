@@ -1,0 +1,1 @@
+"""Network definitions, losses and shipped weights."""

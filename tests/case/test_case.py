@@ -1,0 +1,245 @@
+"""Case folders: what is written comes back, and every field that can be wrong names its file and key."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from femoreg_torch.case import Case, Device, Truth, View, read_case, read_result, write_case, write_json
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import CArm, centred_camera, exp_se3, load_carm
+from femoreg_torch.volume import HIP_LANDMARKS
+
+FILES = ("ct.nii.gz", "labels.nii.gz", "device.stl", "view1.tif", "view1_device.tif", "view2.tif")
+
+
+def pose(seed: int) -> torch.Tensor:
+    return exp_se3(torch.randn(6, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)))
+
+
+def example(folder: Path) -> Case:
+    """A case with two views and everything that is optional; its files are there but empty."""
+    for name in FILES:
+        (folder / name).touch()
+    points = torch.randn(18, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 100
+    landmarks = dict(zip(HIP_LANDMARKS, points, strict=False))
+    device_points = dict(zip(("tip", "base", "center"), points[15:], strict=True))
+    return Case(
+        folder=folder,
+        side="left",
+        ct_path=folder / "ct.nii.gz",
+        labels_path=folder / "labels.nii.gz",
+        structures={"pelvis": (1, 2, 4), "femur_left": (5,), "femur_right": (6,)},
+        landmarks=landmarks,
+        entry_point=points[14],
+        target=landmarks["FH-l"],
+        device=Device(folder / "device.stl", 5000.0, device_points, pose(1)),
+        carm=load_carm("cios_fusion"),
+        views=(
+            View(folder / "view1.tif", folder / "view1_device.tif"),
+            View(folder / "view2.tif", intensity="log"),
+        ),
+        truth=Truth(torch.stack([pose(2), pose(3)]), pose(4), pose(5)),
+    )
+
+
+def assert_same(a: Any, b: Any) -> None:
+    """Equal dataclasses, mappings and values, tensors to the decimals that are written."""
+    if isinstance(a, torch.Tensor):
+        assert a.dtype == b.dtype == torch.float64
+        torch.testing.assert_close(a, b, atol=1e-8, rtol=0)
+    elif isinstance(a, Case | Device | Truth):
+        for name in vars(a):
+            assert_same(getattr(a, name), getattr(b, name))
+    elif isinstance(a, dict):
+        assert list(a) == list(b)
+        for key in a:
+            assert_same(a[key], b[key])
+    else:
+        assert a == b
+
+
+def test_a_written_case_comes_back(tmp_path: Path) -> None:
+    case = example(tmp_path)
+    write_case(tmp_path, case)
+    assert_same(read_case(tmp_path), case)
+    content = yaml.safe_load((tmp_path / "case.yaml").read_text())
+    assert content["plan"]["target"] == "FH"
+    assert content["carm"] == "cios_fusion"
+    assert content["views"][0] == {"anatomy": "view1.tif", "device": "view1_device.tif", "intensity": "raw"}
+
+
+def test_a_case_without_what_is_optional_comes_back(tmp_path: Path) -> None:
+    carm = CArm(centred_camera(1000.0, (0.3, 0.4), (800, 900)), (0.0, 1.0, 600.0), (0.0, 1.0, 0.0))
+    target = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    bare = {"labels_path": None, "structures": {}, "device": None, "views": (), "truth": None}
+    case = replace(example(tmp_path), side="right", target=target, carm=carm, **bare)
+    write_case(tmp_path, case)
+    assert_same(read_case(tmp_path), case)
+
+
+def test_files_outside_the_folder_are_found_from_it(tmp_path: Path) -> None:
+    case = example(tmp_path)
+    (tmp_path / "made").mkdir()
+    write_case(tmp_path / "made", case)
+    assert yaml.safe_load((tmp_path / "made" / "case.yaml").read_text())["ct"]["image"] == "../ct.nii.gz"
+    assert read_case(tmp_path / "made").ct_path.samefile(tmp_path / "ct.nii.gz")
+
+
+def test_names_that_follow_the_side(tmp_path: Path) -> None:
+    case = replace(example(tmp_path), side="right")
+    assert case.femur == "femur_right"
+    assert torch.equal(case.femoral_head, case.landmarks["FH-r"])
+
+
+Change = Callable[[dict[str, Any]], object]
+SCALED = [[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1]]
+MIRRORED = [[-1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1]]
+
+BAD: list[tuple[Change, str]] = [
+    (lambda c: c.update(sied="left"), r"case\.yaml, sied: unknown key"),
+    (lambda c: c.pop("side"), r"case\.yaml, side: is missing, left or right"),
+    (lambda c: c.update(side="both"), r"case\.yaml, side: left or right was expected, found 'both'"),
+    (lambda c: c.update(version=2), r"case\.yaml, version: .* found 2"),
+    (lambda c: c.pop("version"), r"case\.yaml, version: is missing"),
+    (lambda c: c.pop("ct"), r"case\.yaml, ct: is missing"),
+    (lambda c: c.update(ct="ct.nii.gz"), r"case\.yaml, ct: a mapping"),
+    (lambda c: c["ct"].pop("image"), r"ct\.image: is missing"),
+    (lambda c: c["ct"].update(image="no.nii.gz"), r"ct\.image: there is no file .*no\.nii\.gz"),
+    (lambda c: c["ct"].update(image=3), r"ct\.image: the path of a file was expected, found 3"),
+    (lambda c: c["ct"].update(labels="no.nii.gz"), r"ct\.labels: there is no file"),
+    (lambda c: c["ct"].update(label="a"), r"ct\.label: unknown key"),
+    (lambda c: c["ct"].pop("structures"), r"ct\.structures: is missing"),
+    (lambda c: c["ct"]["structures"].update(tibia=[7]), r"ct\.structures\.tibia: unknown key"),
+    (lambda c: c["ct"]["structures"].pop("femur_left"), r"ct\.structures\.femur_left: is missing"),
+    (lambda c: c["ct"]["structures"].update(pelvis=1), r"ct\.structures\.pelvis: a list of label ids"),
+    (lambda c: c["ct"]["structures"].update(pelvis=[0]), r"ct\.structures\.pelvis: a list of label ids"),
+    (lambda c: c["ct"]["structures"].update(pelvis=[1, 5]), r"structures\.femur_left: label 5 belongs to pelvis"),
+    (lambda c: c.update(landmarks="no.json"), r"case\.yaml, landmarks: there is no file"),
+    (lambda c: c["plan"].pop("entry_point"), r"plan\.entry_point: is missing, a point"),
+    (lambda c: c["plan"].update(entry_point=[1, 2]), r"plan\.entry_point: a point \[x, y, z\] in mm"),
+    (lambda c: c["plan"].update(entry_point=[1, 2, float("nan")]), r"plan\.entry_point: a point"),
+    (lambda c: c["plan"].update(entry_point=["a", 2, 3]), r"plan\.entry_point: a point"),
+    (lambda c: c["plan"].pop("target"), r"plan\.target: is missing"),
+    (lambda c: c["plan"].update(target="head"), r"plan\.target: one of FH, GSN"),
+    (lambda c: c["plan"].update(target="ASIS"), r"plan\.target: landmark ASIS-l is not in the landmark file"),
+    (lambda c: c["plan"].update(target=7), r"plan\.target: a point"),
+    (lambda c: c["device"].pop("hu"), r"device\.hu: is missing"),
+    (lambda c: c["device"].update(hu="steel"), r"device\.hu: a number was expected, found 'steel'"),
+    (lambda c: c["device"].update(hu=True), r"device\.hu: a number was expected"),
+    (lambda c: c["device"].update(model="no.stl"), r"device\.model: there is no file"),
+    (lambda c: c["device"]["points"].pop("base"), r"device\.points\.base: is missing"),
+    (lambda c: c["device"]["points"].update(top=[0, 0, 0]), r"device\.points\.top: unknown key"),
+    (lambda c: c["device"]["points"].update(tip=c["device"]["points"]["base"]), r"points\.tip: tip and base are"),
+    (lambda c: c["device"].update(camera1_from_device=SCALED), r"device\.camera1_from_device: not a rigid"),
+    (lambda c: c["device"].update(camera1_from_device=MIRRORED), r"device\.camera1_from_device: a mirrored"),
+    (lambda c: c["device"].update(camera1_from_device=SCALED[:3]), r"device\.camera1_from_device: a 4×4 matrix"),
+    (lambda c: c["device"].update(camera1_from_device=[[1, 2], [3]]), r"device\.camera1_from_device: a 4×4 matrix"),
+    (lambda c: c.update(carm="cios"), r"case\.yaml, carm: no carm preset 'cios'; there are: .*cios_fusion"),
+    (lambda c: c.update(carm=3), r"case\.yaml, carm: "),
+    (lambda c: c.update(carm={"sdd_mm": 1020}), r"case\.yaml, carm: `pixel_mm` is missing"),
+    (lambda c: c.update(carm={"sdd_mm": "far", "pixel_mm": [1, 1], "shape": [9, 9]}), r"case\.yaml, carm\.sdd_mm: "),
+    (lambda c: c.update(views="view1.tif"), r"case\.yaml, views: a list"),
+    (lambda c: c["views"][1].update(anatomy="no.tif"), r"case\.yaml, views\[1\]\.anatomy: there is no file"),
+    (lambda c: c["views"][0].update(device="no.tif"), r"case\.yaml, views\[0\]\.device: there is no file"),
+    (lambda c: c["views"][0].update(intensity="bright"), r"case\.yaml, views\[0\]\.intensity: raw or log"),
+    (lambda c: c["views"][0].update(image="view1.tif"), r"case\.yaml, views\[0\]\.image: unknown key"),
+    (lambda c: c["views"].pop(), r"truth\.json, camera_from_pelvis: 2 poses, but the case has 1 views"),
+    (lambda c: c.update(truth="no.json"), r"case\.yaml, truth: there is no file"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("n", range(len(BAD)))
+def test_bad_fields(tmp_path: Path, n: int) -> None:
+    change, message = BAD[n]
+    write_case(tmp_path, example(tmp_path))
+    content = yaml.safe_load((tmp_path / "case.yaml").read_text())
+    landmarks = json.loads((tmp_path / "landmarks.json").read_text())
+    del landmarks["landmarks"]["ASIS-l"]
+    write_json(tmp_path / "landmarks.json", landmarks)
+    change(content)
+    (tmp_path / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    with pytest.raises(InputError, match=message) as raised:
+        read_case(tmp_path)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "value", "message"),
+    [
+        ("truth.json", "camera1_from_femur", SCALED, r"truth\.json, camera1_from_femur: not a rigid"),
+        ("truth.json", "camera1_from_femur", None, r"truth\.json, camera1_from_femur: is missing"),
+        ("truth.json", "camera1_from_device", None, r"truth\.json, camera1_from_device: is missing"),
+        ("truth.json", "camera_from_pelvis", [SCALED], r"truth\.json, camera_from_pelvis\[0\]: not a rigid"),
+        ("truth.json", "camera_from_pelvis", [], r"truth\.json, camera_from_pelvis: a list"),
+        ("truth.json", "seed", 1, r"truth\.json, seed: unknown key"),
+        ("landmarks.json", "landmarks", {"FH-r": [0, 0, 0]}, r"case\.yaml, landmarks: FH-l, .* is missing"),
+    ],
+)
+def test_bad_truth_and_landmarks(tmp_path: Path, name: str, key: str, value: Any, message: str) -> None:
+    write_case(tmp_path, example(tmp_path))
+    write_json(tmp_path / name, json.loads((tmp_path / name).read_text()) | {key: value})
+    with pytest.raises(InputError, match=message):
+        read_case(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "not a case folder"),
+        (b"- a\n- b\n", "a mapping"),
+        (b"a: [1", "cannot be read as YAML"),
+        (b"\xff\xfe\x00\x80", "cannot be read as YAML"),
+    ],
+)
+def test_what_is_no_case(tmp_path: Path, content: bytes | None, message: str) -> None:
+    if content is not None:
+        (tmp_path / "case.yaml").write_bytes(content)
+    with pytest.raises(InputError, match=message) as raised:
+        read_case(tmp_path)
+    assert "\n" not in str(raised.value)
+
+
+def result() -> dict[str, Any]:
+    return {
+        "camera_from_pelvis": torch.stack([pose(1), pose(2)]),
+        "camera1_from_femur": pose(3),
+        "camera1_from_device": pose(4),
+        "femur_from_device": pose(5),
+        "points_camera1": {"entry_point": torch.ones(3), "tip": torch.zeros(3)},
+        "directions_camera1": {"path": torch.tensor([0.0, 0.0, 1.0])},
+        "preset": "paper",
+        "seed": 3,
+    }
+
+
+def test_a_result_comes_back_as_tensors(tmp_path: Path) -> None:
+    write_json(tmp_path / "result.json", result())
+    again = read_result(tmp_path)
+    for name in ("camera_from_pelvis", "camera1_from_femur", "camera1_from_device", "femur_from_device"):
+        torch.testing.assert_close(again[name], result()[name], atol=1e-8, rtol=0)
+    assert again["points_camera1"]["entry_point"].tolist() == [1, 1, 1]
+    assert again["directions_camera1"]["path"].dtype == torch.float64
+    assert (again["preset"], again["seed"]) == ("paper", 3)
+
+
+def test_a_result_without_a_device_comes_back(tmp_path: Path) -> None:
+    bare = {key: value for key, value in result().items() if "device" not in key} | {"camera1_from_device": None}
+    write_json(tmp_path / "result.json", bare)
+    assert read_result(tmp_path)["camera1_from_device"] is None
+
+
+@pytest.mark.parametrize(
+    "change", [{"camera1_from_femur": SCALED}, {"camera_from_pelvis": None}, {"points_camera1": 3}]
+)
+def test_bad_results(tmp_path: Path, change: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"result\.json"):
+        read_result(tmp_path)
+    write_json(tmp_path / "result.json", result() | change)
+    with pytest.raises(InputError, match=next(iter(change))):
+        read_result(tmp_path)

@@ -1,0 +1,186 @@
+"""The command line: what it finds, how it parses, and that bad input ends in one line and exit status 2."""
+
+import subprocess
+import sys
+import time
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+import femoreg_torch
+from femoreg_torch.commands import main as module
+from femoreg_torch.commands.main import main
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import new_folder
+
+FEMOREG = Path(sys.executable).with_name("femoreg")
+
+
+def measure(
+    images: list[Path],
+    *,
+    out: Path,
+    carm: str = "cios_fusion",
+    preset: Literal["paper", "fast"] = "paper",
+    spacing_mm: float = 1.0,
+    overlay: bool = False,
+) -> None:
+    """Measure the images, in words.
+
+    It takes its time.
+
+    Args:
+        images: What to measure.
+        out: Where to write.
+        carm: The C-arm.
+        preset: How well.
+        spacing_mm: How coarse.
+        overlay: Draw it, too.
+    """
+    print(images, out, carm, preset, spacing_mm, overlay)
+
+
+def fail(kind: str, out: Path) -> None:
+    """End in the way of `kind`."""
+    with new_folder(out) as built:
+        (built / "half.txt").write_text("half")
+        if kind == "bad":
+            raise InputError("case.yaml, side: left or right\nwas expected.")
+        if kind == "missing":
+            (built / "no.txt").read_text()
+        if kind == "forbidden":
+            raise PermissionError(13, "Permission denied", "locked.tif")
+        if kind == "interrupted":
+            raise KeyboardInterrupt
+        raise ZeroDivisionError
+
+
+def read(what: Literal["ct", "image", "case", "landmarks", "mesh"], path: Path) -> None:
+    """Read a file of that kind."""
+    from femoreg_torch import case, fluoro, volume
+
+    {
+        "ct": volume.read_ct,
+        "image": fluoro.read_image,
+        "case": case.read_case,
+        "landmarks": volume.read_landmarks,
+        "mesh": volume.read_mesh,
+    }[what](path)
+
+
+def train(config: Path) -> None:
+    """A command that has a CONFIG of its own."""
+    print(config)
+
+
+@pytest.fixture(autouse=True)
+def commands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The commands of this file in place of the installed ones, for this process."""
+    points = [EntryPoint(name, f"{__name__}:{name}", module.GROUP) for name in ("measure", "fail", "read", "train")]
+    monkeypatch.setattr(module, "entry_points", lambda group: points if group == module.GROUP else [])
+
+
+def test_arguments_reach_the_function(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["measure", "a.png", "b.png", "--out", "run"]) == 0
+    assert capsys.readouterr().out == f"{[Path('a.png'), Path('b.png')]} run cios_fusion paper 1.0 False\n"
+    assert main(["measure", "a.png", "--out", "run", "--preset", "fast", "--spacing-mm", "2", "--overlay"]) == 0
+    assert capsys.readouterr().out == f"{[Path('a.png')]} run cios_fusion fast 2.0 True\n"
+
+
+def test_the_command_line_overrides_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "options.yaml").write_text("out: run\npreset: fast\nspacing_mm: 3\n")
+    assert main(["measure", "a.png", "--config", str(tmp_path / "options.yaml"), "--spacing-mm", "4"]) == 0
+    assert capsys.readouterr().out == f"{[Path('a.png')]} run cios_fusion fast 4.0 False\n"
+
+
+def test_a_command_may_have_a_config_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "small.yaml"]) == 0
+    assert capsys.readouterr().out == "small.yaml\n"
+
+
+def test_help_of_a_command_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["measure", "--help"])
+    assert stopped.value.code == 0
+    text = capsys.readouterr().out
+    for words in ("femoreg measure", "It takes its time.", "What to measure.", "--spacing-mm", "How coarse.", "paper"):
+        assert words in text
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["paint"], "no command 'paint'; there are: measure, fail, read, train."),
+        (["--paint"], "no command '--paint'"),
+        (["measure"], "the following arguments are required"),
+        (["measure", "a.png"], "out"),
+        (["measure", "a.png", "--out", "run", "--preset", "best"], "best"),
+        (["measure", "a.png", "--out", "run", "--spacing-mm", "wide"], "wide"),
+        (["measure", "a.png", "--out", "run", "--paint", "1"], "--paint"),
+        (["measure", "a.png", "--out", "run", "--config", "no.yaml"], "no.yaml"),
+    ],
+)
+def test_wrong_arguments_are_one_line(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(argv) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("femoreg: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "status", "message"),
+    [
+        ("bad", 2, "femoreg: case.yaml, side: left or right was expected.\n"),
+        ("missing", 2, "no.txt: No such file or directory.\n"),
+        ("forbidden", 2, "femoreg: locked.tif: Permission denied.\n"),
+        ("interrupted", 130, "femoreg: interrupted.\n"),
+    ],
+)
+def test_a_run_that_ends_early_says_why_and_leaves_nothing(
+    tmp_path: Path, kind: str, status: int, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fail", kind, str(tmp_path / "run")]) == status
+    error = capsys.readouterr().err
+    assert error.endswith(message)
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_defect_keeps_its_traceback(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError):
+        main(["fail", "defect", str(tmp_path / "run")])
+
+
+@pytest.mark.parametrize("what", ["ct", "image", "case", "landmarks", "mesh"])
+@pytest.mark.parametrize("kind", ["missing", "garbage", "folder"])
+def test_unreadable_files_are_one_line(tmp_path: Path, what: str, kind: str, capfd: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / {"ct": "ct.nii.gz", "image": "view.tif", "landmarks": "points.json", "mesh": "a.stl"}.get(
+        what, "case"
+    )
+    if kind == "garbage":
+        path.write_bytes(b"\x00garbage\xff" * 50)
+    elif kind == "folder":
+        path.mkdir()
+    assert main(["read", what, str(path)]) == 2
+    error = capfd.readouterr().err
+    assert error.startswith(f"femoreg: {path}: ")
+    assert error.count("\n") == 1
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"femoreg {femoreg_torch.__version__}\n"
+
+
+def test_the_installed_overview_is_quick_and_complete() -> None:
+    start = time.perf_counter()
+    done = subprocess.run([FEMOREG, "--help"], capture_output=True, encoding="utf-8", check=True)
+    assert time.perf_counter() - start < 2  # 0.15 s on an idle machine: no command is imported
+    for name in ("demo", "detect", "evaluate", "phantom", "register", "simulate", "train"):
+        (line,) = (line for line in done.stdout.splitlines() if line.startswith(f"  {name} "))
+        assert len(line.split()) > 3
+        assert "not installed" not in line
+    assert done.stderr == ""

@@ -1,0 +1,173 @@
+"""Images from files, and every way in which a file can be wrong."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pydicom
+import pytest
+import SimpleITK as sitk  # noqa: N813 (its own documentation's name)
+import torch
+from pydicom.dataset import FileDataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import check_matches, read_image, write_image
+from femoreg_torch.geometry import load_carm
+
+PIXELS = np.random.default_rng(0).integers(0, 4096, (12, 10), dtype=np.uint16)
+
+
+def write_dicom(path: Path, pixels: np.ndarray = PIXELS, **fields: object) -> Path:
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID = XRayAngiographicImageStorage
+    meta.MediaStorageSOPInstanceUID = "1.2.3"
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    dataset = FileDataset(str(path), {}, file_meta=meta, preamble=b"\0" * 128)
+    settings = {
+        "SOPClassUID": meta.MediaStorageSOPClassUID,
+        "SOPInstanceUID": "1.2.3",
+        "Rows": pixels.shape[-2],
+        "Columns": pixels.shape[-1],
+        "SamplesPerPixel": 1,
+        "PhotometricInterpretation": "MONOCHROME2",
+        "BitsAllocated": 16,
+        "BitsStored": 12,
+        "HighBit": 11,
+        "PixelRepresentation": 0,
+        "PixelData": pixels.tobytes(),
+    } | fields
+    for name, value in settings.items():
+        setattr(dataset, name, value)
+    pydicom.dcmwrite(path, dataset)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".tiff", ".TIF"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_pictures_as_stored(tmp_path: Path, suffix: str, dtype: type) -> None:
+    pixels = (PIXELS // (1 if dtype is np.uint16 else 16)).astype(dtype)
+    cv2.imwrite(str(tmp_path / f"view{suffix}"), pixels)
+    image = read_image(tmp_path / f"view{suffix}")
+    assert image.dtype == torch.float32
+    np.testing.assert_array_equal(image.numpy(), pixels)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_written_images_come_back(tmp_path: Path, suffix: str) -> None:
+    pixels = torch.from_numpy(PIXELS * 16)
+    write_image(tmp_path / f"view{suffix}", pixels)
+    assert torch.equal(read_image(tmp_path / f"view{suffix}"), pixels.float())
+    assert [p.name for p in tmp_path.iterdir()] == [f"view{suffix}"]
+
+
+@pytest.mark.parametrize("name", ["view.nii.gz", "view.mha", "slice.mha", "slice.nii.gz", "view.nrrd"])
+def test_itk_formats_of_two_dimensions_or_one_slice(tmp_path: Path, name: str) -> None:
+    pixels = PIXELS.astype(np.float32)
+    sitk.WriteImage(sitk.GetImageFromArray(pixels[None] if "slice" in name else pixels), str(tmp_path / name))
+    np.testing.assert_array_equal(read_image(tmp_path / name).numpy(), pixels)
+
+
+@pytest.mark.parametrize("name", ["view.dcm", "IM0001"])
+def test_dicom(tmp_path: Path, name: str) -> None:
+    np.testing.assert_array_equal(read_image(write_dicom(tmp_path / name)).numpy(), PIXELS)
+
+
+def test_dicom_rescale(tmp_path: Path) -> None:
+    path = write_dicom(tmp_path / "view.dcm", RescaleSlope=2, RescaleIntercept=-7)
+    np.testing.assert_array_equal(read_image(path).numpy(), PIXELS * 2.0 - 7)
+
+
+def test_dicom_that_shows_low_values_bright_is_inverted(tmp_path: Path) -> None:
+    path = write_dicom(tmp_path / "view.dcm", PhotometricInterpretation="MONOCHROME1")
+    np.testing.assert_array_equal(read_image(path).numpy(), 4095.0 - PIXELS)
+    signed = (PIXELS.astype(np.int16) - 2048).astype(np.int16)
+    path = write_dicom(tmp_path / "signed.dcm", signed, PhotometricInterpretation="MONOCHROME1", PixelRepresentation=1)
+    np.testing.assert_array_equal(read_image(path).numpy(), -1.0 - signed)
+
+
+def damaged(kind: str, folder: Path) -> Path:
+    """An image that is wrong in the way of `kind`."""
+    path = folder / "view.png"
+    floats = PIXELS.astype(np.float32)
+    floats[3, 4] = np.nan
+    if kind == "text":
+        path.write_text("not an image")
+    elif kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "colour":
+        cv2.imwrite(str(path), np.random.default_rng(1).integers(0, 255, (12, 10, 3), dtype=np.uint8))
+    elif kind == "constant":
+        cv2.imwrite(str(path), np.full((12, 10), 77, np.uint8))
+    elif kind == "cut":
+        cv2.imwrite(str(path), PIXELS)
+        path.write_bytes(path.read_bytes()[:30])
+    elif kind == "no dicom":
+        path = folder / "view.jpeg2"
+        path.write_text("not an image")
+    elif kind.startswith("nan"):
+        path = folder / f"view.{kind.removeprefix('nan ')}"
+        sitk.WriteImage(sitk.GetImageFromArray(floats), str(path))
+    elif kind == "volume":
+        path = folder / "view.mha"
+        sitk.WriteImage(sitk.GetImageFromArray(np.stack([PIXELS] * 5)), str(path))
+    elif kind == "frames":
+        path = write_dicom(folder / "view.dcm", np.stack([PIXELS] * 2), NumberOfFrames=2)
+    elif kind == "no pixels":
+        path = write_dicom(folder / "view.dcm")
+        dataset = pydicom.dcmread(path)
+        del dataset.PixelData
+        dataset.save_as(path)
+    elif kind == "short pixels":
+        path = write_dicom(folder / "view.dcm", Rows=50)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("missing", "no such file"),
+        ("text", "cannot be read as a PNG or TIFF"),
+        ("empty", "cannot be read as a PNG or TIFF"),
+        ("cut", "cannot be read as a PNG or TIFF"),
+        ("colour", "colour image"),
+        ("constant", "every pixel is 77"),
+        ("no dicom", "not a DICOM file"),
+        ("nan tif", "not finite"),
+        ("nan mha", "not finite"),
+        ("nan nii", "not finite"),
+        ("volume", "one image was expected, found 5 × 12 × 10"),
+        ("frames", "2 frames"),
+        ("no pixels", "no image that can be decoded"),
+        ("short pixels", "no image that can be decoded"),
+    ],
+)
+def test_bad_images(tmp_path: Path, kind: str, message: str) -> None:
+    path = damaged(kind, tmp_path)
+    with pytest.raises(InputError, match=message) as raised:
+        read_image(path)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_an_image_of_another_shape_than_the_detector() -> None:
+    camera = load_carm("cios_fusion").camera
+    check_matches(torch.zeros(1536, 1536), camera, "case.yaml, views[1].anatomy: view2.tif")
+    with pytest.raises(InputError) as raised:
+        check_matches(torch.zeros(1024, 1536), camera, "case.yaml, views[1].anatomy: view2.tif")
+    assert str(raised.value).startswith(
+        "case.yaml, views[1].anatomy: view2.tif is 1024 × 1536 pixels, but the C-arm has 1536 × 1536."
+    )
+
+
+@pytest.mark.parametrize(
+    ("image", "name"), [(torch.zeros(3, 4), "a.png"), (torch.zeros(2, 3, 4).to(torch.uint16), "a.png")]
+)
+def test_only_16_bit_grey_images_are_written(tmp_path: Path, image: torch.Tensor, name: str) -> None:
+    with pytest.raises(InputError, match="uint16"):
+        write_image(tmp_path / name, image)
+
+
+def test_an_image_is_not_written_into_a_folder_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no folder"):
+        write_image(tmp_path / "no" / "view.png", torch.from_numpy(PIXELS))

@@ -1,0 +1,54 @@
+"""The log transform against Beer and Lambert, and coarser pixels against the camera that goes with them."""
+
+import pytest
+import torch
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import attenuation_image, downsample
+from femoreg_torch.geometry import centred_camera, project_points
+
+
+def test_attenuation_is_recovered_from_counts() -> None:
+    thickness = torch.zeros(64, 48)
+    thickness[20:40, 10:30] = torch.linspace(0.5, 3.0, 20)  # line integrals of a bone; the beam is open around it
+    torch.testing.assert_close(attenuation_image(30000 * torch.exp(-thickness)), thickness, atol=1e-4, rtol=0)
+
+
+def test_one_hot_pixel_does_not_set_the_open_beam() -> None:
+    raw = torch.full((32, 32), 1000.0)
+    raw[5, 5] = 60000.0
+    assert attenuation_image(raw)[20, 20] == pytest.approx(-torch.tensor(1000 / 6000).log().item(), abs=0.4)
+    assert attenuation_image(raw)[5, 5] < 0
+
+
+def test_pixels_without_a_count_are_as_dark_as_the_darkest_other() -> None:
+    raw = torch.full((16, 16), 1000.0)
+    raw[4, 4], raw[8, 8], raw[9, 9] = 0.0, 10.0, -3.0
+    attenuation = attenuation_image(raw)
+    assert torch.isfinite(attenuation).all()
+    assert attenuation[4, 4] == attenuation[8, 8] == attenuation[9, 9] == attenuation.max()
+
+
+def test_an_image_without_a_positive_pixel_is_refused() -> None:
+    with pytest.raises(InputError, match="no pixel is positive"):
+        attenuation_image(-torch.rand(8, 8, generator=torch.Generator().manual_seed(0)))
+
+
+def test_downsampling_averages_blocks_and_drops_what_fills_none() -> None:
+    images = torch.rand(2, 3, 14, 21, generator=torch.Generator().manual_seed(0))
+    coarse = downsample(images, 4)
+    assert tuple(coarse.shape) == (2, 3, 3, 5)
+    torch.testing.assert_close(coarse[1, 2, 2, 4], images[1, 2, 8:12, 16:20].mean())
+    torch.testing.assert_close(downsample(images[0, 0], 4), coarse[0, 0])
+
+
+def test_a_blob_stays_where_the_coarser_camera_sees_it() -> None:
+    camera = centred_camera(1000.0, (0.5, 0.4), (96, 128))
+    pixel = project_points(camera, torch.tensor([[3.0, -4.0, 700.0]]).double())[0]
+    rows, columns = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
+    blob = torch.exp(-((columns - pixel[0]) ** 2 + (rows - pixel[1]) ** 2) / (2 * 5.0**2))
+    coarse = downsample(blob, 4)
+    expected = project_points(camera.downsampled(4), torch.tensor([[3.0, -4.0, 700.0]]).double())[0]
+    rows, columns = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
+    found = torch.stack([(coarse * columns).sum(), (coarse * rows).sum()]) / coarse.sum()
+    torch.testing.assert_close(found.double(), expected, atol=1e-3, rtol=0)

@@ -1,0 +1,77 @@
+"""Every optimiser on problems of known minimum; seeds; reasons to stop."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from femoreg_torch.optimize import Bobyqa, CmaEs, Settings, Stop, minimise
+
+MINIMUM = torch.tensor([0.3, -0.2, 0.5, 0.1, -0.4, 0.2], dtype=torch.float64)
+SETTINGS = [CmaEs(population=20, max_evaluations=4000), Bobyqa()]
+
+
+def bowl(deltas: Tensor) -> Tensor:
+    """A tilted quadratic, condition 100, minimum 2 at MINIMUM."""
+    axes = torch.linalg.qr(torch.vander(torch.linspace(-1, 1, 6, dtype=torch.float64))).Q
+    return 2 + (((deltas - MINIMUM) @ axes) ** 2 * torch.logspace(0, 2, 6, dtype=torch.float64)).sum(-1)
+
+
+def ripples(deltas: Tensor) -> Tensor:
+    """Many local minima around the global one at MINIMUM (Rastrigin)."""
+    d = deltas - MINIMUM
+    return (d**2 + 0.05 * (1 - torch.cos(12 * d))).sum(-1)
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_finds_the_minimum_of_a_bowl(settings: Settings) -> None:
+    result = minimise(bowl, 6, settings, seed=1)
+    torch.testing.assert_close(result.delta, MINIMUM, atol=2e-3, rtol=0)
+    assert result.value == pytest.approx(2, abs=1e-3)
+    assert result.stop in (Stop.SMALL_STEP, Stop.FLAT)
+
+
+def test_cma_es_crosses_local_minima() -> None:
+    result = minimise(ripples, 6, CmaEs(population=60, max_evaluations=8000), seed=0)
+    torch.testing.assert_close(result.delta, MINIMUM, atol=1e-2, rtol=0)
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_result_is_the_best_point_met_and_the_trace_falls(settings: Settings) -> None:
+    met: list[float] = []
+
+    def watched(deltas: Tensor) -> Tensor:
+        values = bowl(deltas)
+        met.extend(values.tolist())
+        return values
+
+    result = minimise(watched, 6, settings, seed=3)
+    assert result.value == min(met) == result.trace[-1][1]
+    assert result.evaluations == len(met)
+    assert [value for _, value, _ in result.trace] == sorted((value for _, value, _ in result.trace), reverse=True)
+
+
+def test_same_seed_same_bits_other_seed_another_path() -> None:
+    settings = CmaEs(population=12, max_evaluations=300)
+    first, again, other = (minimise(bowl, 6, settings, seed) for seed in (0, 0, 1))
+    assert torch.equal(first.delta, again.delta)
+    assert first.trace == again.trace
+    assert not torch.equal(first.delta, other.delta)
+
+
+@pytest.mark.parametrize("settings", [CmaEs(population=10, max_evaluations=50), Bobyqa(max_evaluations=20)])
+def test_the_budget_is_kept(settings: Settings) -> None:
+    result = minimise(ripples, 6, settings, seed=0)
+    assert result.stop is Stop.BUDGET
+    assert result.evaluations <= settings.max_evaluations + 12  # a generation, the start and the mean
+
+
+def test_bobyqa_stays_in_its_box() -> None:
+    result = minimise(lambda d: ((d - 3) ** 2).sum(-1), 2, Bobyqa(), seed=0)
+    torch.testing.assert_close(result.delta, torch.ones(2, dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # cma takes the mean of nothing on its way
+def test_an_objective_that_is_never_finite_is_an_error(settings: Settings) -> None:
+    with pytest.raises((ArithmeticError, ValueError, RuntimeError)):
+        minimise(lambda d: torch.full((len(d),), torch.nan, dtype=torch.float64), 2, settings, seed=0)

@@ -1,0 +1,66 @@
+"""Presets as data: those that ship, and what a mistake in one says."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from femoreg_torch.configs import preset_names
+from femoreg_torch.errors import InputError
+from femoreg_torch.optimize import Bobyqa, CmaEs
+from femoreg_torch.registration import load_plan
+from femoreg_torch.registration import plan as plan_module
+from femoreg_torch.registration.plan import OrbitSearch, Stage
+
+STAGE = {
+    "name": "a",
+    "images": "first",
+    "kinds": ["anatomy"],
+    "render": ["pelvis"],
+    "bodies": [{"move": ["pelvis"], "centre": "pelvis", "rotation_deg": [1, 1, 1], "translation_mm": [1, 1, 1]}],
+    "level": {"downsample": 8, "step_mm": 1, "patch_radius": 5},
+    "optimiser": {"population": 10},
+}
+
+
+@pytest.mark.parametrize("name", preset_names("registration"))
+def test_every_preset_loads_and_registers_everything(name: str) -> None:
+    steps = load_plan(name).steps
+    moved = {what for step in steps if isinstance(step, Stage) for body in step.bodies for what in body.move}
+    assert moved == {"pelvis", "femur", "device", "view"}
+    assert any(isinstance(step, OrbitSearch) for step in steps)
+
+
+def test_the_paper_preset_is_the_papers() -> None:
+    steps = load_plan("paper").steps
+    assert {step.level.downsample for step in steps} == {4}
+    orbit = next(step for step in steps if isinstance(step, OrbitSearch))
+    assert (orbit.half_range_deg, orbit.step_deg) == (45, 0.5)
+    joint = [step for step in steps if isinstance(step, Stage) and len(step.bodies) > 1]
+    assert all(isinstance(step.optimiser, Bobyqa) for step in joint)
+    single = [step for step in steps if isinstance(step, Stage) and len(step.bodies) == 1]
+    assert all(isinstance(step.optimiser, CmaEs) for step in single)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"images": "second"}, "step 1.*images"),
+        ({"colour": "red"}, "step 1.*colour"),
+        ({"render": ["tibia"]}, "step 1.*tibia"),
+        ({"bodies": [{**STAGE["bodies"][0], "rotation_deg": [1, 1]}]}, "need three numbers"),  # type: ignore[index,dict-item]
+        ({"optimiser": {"popsize": 3}}, "step 1"),
+    ],
+)
+def test_a_mistake_is_told_with_preset_and_step(
+    change: dict[str, object], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    text = yaml.safe_dump({"steps": [STAGE | change]})
+    monkeypatch.setattr(plan_module, "load_preset", lambda *_: yaml.safe_load(text))
+    with pytest.raises(InputError, match=says):
+        load_plan("mine")
+
+
+def test_an_unknown_preset_lists_the_known_ones() -> None:
+    with pytest.raises(InputError, match=r"no registration preset 'slow'; there are: .*paper"):
+        load_plan("slow")

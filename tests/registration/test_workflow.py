@@ -1,0 +1,175 @@
+"""Stages and whole plans recover known poses; the laws that bodies and stages obey."""
+
+import math
+
+import pytest
+import torch
+from registration.scenes import REFERENCE_POINTS, error, float64, make_scene, off, true_poses
+
+from femoreg_torch.geometry import rotation_angle, transform_points
+from femoreg_torch.optimize import Bobyqa, CmaEs
+from femoreg_torch.registration import Plan, Poses, Scene, run_plan
+from femoreg_torch.registration.objective import Level, Prior, image_costs, stage_objective
+from femoreg_torch.registration.plan import BodyPlan, OrbitSearch, Stage
+from femoreg_torch.registration.scene import Body, first_view_only, moved
+from femoreg_torch.registration.workflow import run_stage
+
+LEVEL = Level(downsample=1, step_mm=2.0, patch_radius=4)
+TRUTH = true_poses()
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(TRUTH)
+
+
+def pelvis_stage(optimiser: CmaEs | Bobyqa, images: str = "first") -> Stage:
+    body = BodyPlan(["pelvis"], "pelvis", [3, 3, 3], [4, 4, 15])
+    return Stage("pelvis", images, ["anatomy"], ["pelvis", "femur"], [body], LEVEL, optimiser)  # type: ignore[arg-type]
+
+
+PLAN = Plan(
+    "test",
+    (
+        Stage(
+            "pelvis and femur",
+            "first",
+            ["anatomy"],
+            ["pelvis", "femur"],
+            [
+                BodyPlan(["pelvis", "femur"], "pelvis", [2, 2, 2], [3, 3, 12]),
+                BodyPlan(["femur"], "femur", [4, 4, 4], [0, 0, 0]),
+            ],
+            LEVEL,
+            CmaEs(population=24, max_evaluations=1500),
+        ),
+        OrbitSearch("orbit", ["pelvis", "femur"], 30, 1, LEVEL),
+        Stage(
+            "other views",
+            "each other",
+            ["anatomy"],
+            ["pelvis", "femur"],
+            [BodyPlan(["view"], "pelvis", [2, 2, 2], [4, 4, 12])],
+            LEVEL,
+            CmaEs(population=16, max_evaluations=700),
+        ),
+        Stage(
+            "pelvis and femur in all views",
+            "all",
+            ["anatomy"],
+            ["pelvis", "femur"],
+            [BodyPlan(["pelvis"], "pelvis", [2, 2, 2], [3, 3, 3]), BodyPlan(["femur"], "femur", [2, 2, 2], [3, 3, 3])],
+            LEVEL,
+            Bobyqa(max_evaluations=200),
+        ),
+        Stage(
+            "device",
+            "all",
+            ["device"],
+            ["pelvis", "femur", "device"],
+            [BodyPlan(["device"], "device", [3, 3, 3], [5, 5, 5])],
+            LEVEL,
+            CmaEs(population=16, max_evaluations=700),
+        ),
+    ),
+)
+
+
+def started(with_device: bool = True) -> Poses:
+    start = {
+        "pelvis": off(TRUTH.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"], (3, -2, 2), (3, -4, 15)),
+        "femur": off(TRUTH.camera1_from["femur"], REFERENCE_POINTS["femur"], (5, 0, -5), (0, 0, 0)),
+    }
+    if with_device:
+        start["device"] = off(TRUTH.camera1_from["device"], REFERENCE_POINTS["device"], (3, 3, -2), (5, -4, 5))
+    return first_view_only(start, 3)
+
+
+def test_a_known_offset_is_recovered_from_all_views(scene: Scene) -> None:
+    start = off(TRUTH.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"], (2, -2, 1), (2, -3, 8))
+    stage = pelvis_stage(CmaEs(population=20, max_evaluations=800), "all")
+    found = run_stage(scene, TRUTH.with_object("pelvis", start), stage, (0, 1, 2), seed=0).poses
+    mm, deg = error(found.camera1_from["pelvis"], TRUTH.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"])
+    assert mm < 0.3
+    assert deg < 0.15
+
+
+def test_a_whole_plan_finds_every_pose(scene: Scene) -> None:
+    start = started()
+    starts_with = off(TRUTH.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"], (2, -2, 1), (3, -4, 12))
+    outcome = run_plan(scene, PLAN, starts_with, start.camera1_from["device"], seed=1, report=lambda *_: None)
+    for name, limit_mm in (("pelvis", 1.0), ("femur", 1.5), ("device", 1.0)):
+        mm, deg = error(outcome.poses.camera1_from[name], TRUTH.camera1_from[name], REFERENCE_POINTS[name])
+        assert mm < limit_mm, name
+        assert deg < 1.0, name
+    for view in (1, 2):
+        found, true = outcome.poses.camera_from_camera1[view], TRUTH.camera_from_camera1[view]
+        assert math.degrees(float(rotation_angle(found[:3, :3] @ true[:3, :3].T))) < 0.6
+    assert [entry.name for entry in outcome.trace if entry.view == 2] == ["orbit", "other views"]
+
+
+def test_same_seed_same_poses_bit_for_bit(scene: Scene) -> None:
+    stage = pelvis_stage(CmaEs(population=10, max_evaluations=60))
+    first, again, other = (run_stage(scene, started(), stage, (0,), seed).poses for seed in (4, 4, 5))
+    assert torch.equal(first.camera1_from["pelvis"], again.camera1_from["pelvis"])
+    assert not torch.equal(first.camera1_from["pelvis"], other.camera1_from["pelvis"])
+
+
+def test_steps_of_the_device_are_left_out_where_it_has_no_images() -> None:
+    without = make_scene(TRUTH, with_device=False)
+    plan = Plan("test", (pelvis_stage(Bobyqa(max_evaluations=15)), PLAN.steps[-1]))
+    outcome = run_plan(without, plan, TRUTH.camera1_from["pelvis"], float64(*[1] * 16).view(4, 4), 0, lambda *_: None)
+    assert [entry.name for entry in outcome.trace] == ["pelvis"]
+    assert "device" not in outcome.poses.camera1_from
+
+
+def test_rotation_only_keeps_the_centre(scene: Scene) -> None:
+    stage = Stage(
+        "femur",
+        "first",
+        ["anatomy"],
+        ["femur"],
+        [BodyPlan(["femur"], "femur", [5, 5, 5], [0, 0, 0])],
+        LEVEL,
+        CmaEs(population=8, max_evaluations=40),
+    )
+    start = started()
+    found = run_stage(scene, start, stage, (0,), seed=0).poses
+    centre = REFERENCE_POINTS["femur"][None]
+    before, after = (transform_points(p.camera1_from["femur"], centre) for p in (start, found))
+    torch.testing.assert_close(after, before)
+    assert not torch.equal(found.camera1_from["femur"], start.camera1_from["femur"])
+
+
+def test_moving_a_view_moves_all_objects_in_it_and_nothing_elsewhere() -> None:
+    body = Body((), 1, float64(0, 0, 740), float64(0.1, 0.1, 0.1, 5, 5, 5))
+    after = moved(TRUTH, (body,), float64(1, 0, -1, 0.5, 1, 0))
+    assert torch.equal(after.camera1_from["pelvis"], TRUTH.camera1_from["pelvis"])
+    assert torch.equal(after.camera_from("femur")[2], TRUTH.camera_from("femur")[2])
+    motion = body.motion(float64(1, 0, -1, 0.5, 1, 0)[None])[0]
+    torch.testing.assert_close(after.camera_from("femur")[1], motion @ TRUTH.camera_from("femur")[1])
+
+
+def test_objective_is_least_at_the_truth_and_grows_along_every_axis(scene: Scene) -> None:
+    body = Body(("pelvis",), 0, TRUTH.camera1_from["pelvis"][:3, 3], float64(0.02, 0.02, 0.02, 2, 2, 12))
+    costs = image_costs(scene, TRUTH, (body,), ["pelvis", "femur"], [("anatomy", v) for v in range(3)], LEVEL)
+    deltas = torch.cat([torch.zeros(1, 6), torch.eye(6), -torch.eye(6)]).double()
+    values = stage_objective(costs, (body,), None)(deltas)
+    assert int(values.argmin()) == 0
+    assert (values[1:] > values[0] + 0.005).all()
+
+
+def test_what_stands_still_is_drawn_as_what_moves_by_nothing(scene: Scene) -> None:
+    body = Body(("femur",), 0, TRUTH.camera1_from["femur"][:3, 3], torch.ones(6, dtype=torch.float64))
+    everything = Body(("pelvis", "femur"), 0, float64(0, 0, 700), torch.ones(6, dtype=torch.float64))
+    images = [("anatomy", 0), ("anatomy", 2)]
+    zero = torch.zeros(1, 6, dtype=torch.float64)
+    drawn = ["pelvis", "femur"]
+    one, both = (image_costs(scene, TRUTH, (b,), drawn, images, LEVEL)(zero) for b in (body, everything))  # type: ignore[arg-type]
+    torch.testing.assert_close(one, both, atol=1e-6, rtol=0)
+
+
+def test_prior_is_half_the_squared_size_of_the_motion() -> None:
+    body = Body(("pelvis",), 0, float64(0, 0, 0), float64(math.radians(5), 0, 0, 10, 0, 0))
+    objective = stage_objective(lambda d: torch.zeros(len(d), 1).double(), (body,), Prior(10, 20, 0.4))
+    torch.testing.assert_close(objective(float64(2, 1)[None]), float64(0.4 * 0.5 * (1 + 0.25)))

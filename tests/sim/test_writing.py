@@ -1,0 +1,84 @@
+"""Folders of the simulator, from a procedural patient to a complete case."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from femoreg_torch.case import read_case, write_case
+from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import read_image
+from femoreg_torch.volume import read_ct, read_labels, read_mesh
+from sim.commands import phantom, simulate
+from sim.writing import SIMULATION_STEPS, write_simulation
+
+
+@pytest.fixture(scope="module")
+def patient(tmp_path_factory):
+    """A coarse procedural patient under a C-arm with 16 × 16 of its pixels in one, to be quick."""
+    folder = tmp_path_factory.mktemp("phantom") / "patient"
+    phantom(folder, seed=2, side="right", spacing_mm=2.0)
+    case = read_case(folder)
+    write_case(folder, replace(case, carm=replace(case.carm, camera=case.carm.camera.downsampled(16))))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def simulated(patient, tmp_path_factory):
+    out = tmp_path_factory.mktemp("simulated") / "case"
+    simulate(patient, out=out, seed=5)
+    return out
+
+
+def test_a_phantom_is_a_case_without_images(patient):
+    case = read_case(patient)
+    assert case.side == "right"
+    assert case.views == ()
+    assert len(case.landmarks) == 14
+    assert read_mesh(case.device.model_path).is_watertight
+    labels = read_labels(case.labels_path, read_ct(case.ct_path))
+    assert set(np.unique(labels.data)) == {0, 1, 2, 3, 4, 5, 6}
+    assert case.entry_point[0] < case.femoral_head[0]  # on the right, lateral is −x
+
+
+def test_a_simulated_case_is_complete(simulated):
+    case = read_case(simulated)
+    assert case.side == "right"
+    assert len(case.views) == 3
+    assert case.truth.camera_from_pelvis.shape == (3, 4, 4)
+    assert case.truth.camera1_from_device is not None
+    assert (simulated / "preview.png").is_file()
+    for view in case.views:
+        anatomy, device = read_image(view.anatomy), read_image(view.device)
+        assert anatomy.shape == case.carm.camera.shape
+        assert anatomy.max() > 2 * anatomy.min()
+        assert ((device < 0.7 * anatomy).float().mean() > 0.01).item()
+
+
+def test_the_same_seed_writes_the_same_case(patient, simulated, tmp_path):
+    for seed, same in ((5, True), (6, False)):
+        out = tmp_path / str(seed)
+        simulate(patient, out=out, seed=seed)
+        for name in ("view1.tif", "view3_device.tif", "truth.json"):
+            assert ((out / name).read_bytes() == (simulated / name).read_bytes()) is same
+
+
+def test_the_other_hip_gets_a_plan_of_its_own(patient, tmp_path):
+    simulate(patient, out=tmp_path / "left", seed=5, side="left")
+    case = read_case(tmp_path / "left")
+    assert case.side == "left"
+    assert case.entry_point[0] > case.femoral_head[0]
+
+
+def test_every_step_is_reported(patient, tmp_path):
+    steps = []
+    write_simulation(patient, tmp_path / "case", 5, None, "paper", steps.append)
+    assert len(steps) == SIMULATION_STEPS
+
+
+def test_bad_input_leaves_nothing_behind(patient, tmp_path):
+    with pytest.raises(InputError, match="no simulation preset"):
+        simulate(patient, out=tmp_path / "case", config="none")
+    with pytest.raises(InputError, match=r"ct\.nii\.gz"):
+        simulate(tmp_path, out=tmp_path / "case")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,121 @@
+"""Patch Grad-NCC against a slow, literal computation, and the laws it obeys."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.similarity import grad_ncc
+from femoreg_torch.similarity.kernels import image_gradients, patch_sums
+
+
+def picture(seed: int, height: int = 40, width: int = 33) -> Tensor:
+    generator = np.random.default_rng(seed)
+    return torch.from_numpy(cv2.GaussianBlur(generator.random((height, width), np.float32), (0, 0), 2.0))
+
+
+def literal_cost(fixed: Tensor, moving: Tensor, radius: int) -> float:
+    """Mean over patches and derivatives of 1 − NCC, patch by patch with OpenCV's Sobel and NumPy's correlation."""
+    total, count = 0.0, 0
+    for dx, dy in ((1, 0), (0, 1)):
+        f, m = (cv2.Sobel(i.numpy(), cv2.CV_64F, dx, dy, borderType=cv2.BORDER_REPLICATE) for i in (fixed, moving))
+        for y in range(radius, f.shape[0] - radius):
+            for x in range(radius, f.shape[1] - radius):
+                window = np.s_[y - radius : y + radius + 1, x - radius : x + radius + 1]
+                total += 1 - np.corrcoef(f[window].ravel(), m[window].ravel())[0, 1]
+                count += 1
+    return total / count
+
+
+def test_equals_the_literal_definition() -> None:
+    fixed, moving = picture(0), picture(1)
+    cost = grad_ncc(fixed, 3, smoothing_px=0)(moving[None])
+    assert float(cost) == pytest.approx(literal_cost(fixed, moving, 3), abs=1e-5)
+
+
+def test_derivatives_equal_a_smoothed_sobel_away_from_the_border() -> None:
+    image = picture(2)
+    dx, dy = image_gradients(image[None].double(), 1.1)[0].numpy()
+    smooth = cv2.GaussianBlur(image.numpy().astype(np.float64), (5, 5), 1.1)
+    inside = np.s_[4:-4, 4:-4]
+    np.testing.assert_allclose(dx[inside], (cv2.Sobel(smooth, cv2.CV_64F, 1, 0) / 8)[inside], atol=1e-9)
+    np.testing.assert_allclose(dy[inside], (cv2.Sobel(smooth, cv2.CV_64F, 0, 1) / 8)[inside], atol=1e-9)
+
+
+def test_patch_sums_equal_direct_sums() -> None:
+    maps = torch.rand(2, 9, 11, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    sums = patch_sums(maps, 2)
+    assert sums.shape == (2, 5, 7)
+    torch.testing.assert_close(sums[1, 3, 4], maps[1, 3:8, 4:9].sum())
+
+
+def test_a_perfect_match_costs_nothing_whatever_its_scale_and_offset() -> None:
+    fixed = picture(3)
+    costs = grad_ncc(fixed, 4)(torch.stack([fixed, 3 * fixed + 7, -fixed]))
+    torch.testing.assert_close(costs, torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64), atol=1e-5, rtol=0)
+
+
+def test_flat_patches_count_as_uncorrelated_and_have_no_gradient() -> None:
+    fixed = picture(4)
+    nothing = torch.zeros(1, *fixed.shape, requires_grad=True)
+    cost = grad_ncc(fixed, 4)(nothing)
+    cost.sum().backward()
+    assert cost.item() == 1.0
+    assert nothing.grad is not None
+    assert not nothing.grad.any()
+    assert float(grad_ncc(torch.zeros(20, 20), 3)(picture(5, 20, 20)[None])) == 1.0
+
+
+def test_compiled_and_plain_torch_agree_in_value_and_gradient() -> None:
+    fixed = picture(6)
+    fixed[:12] = 0.4  # flat patches too
+    moving = torch.stack([picture(7), picture(8), fixed])
+    similarity = grad_ncc(fixed, 3)
+    fast, slow = moving.clone().requires_grad_(), moving.double().requires_grad_()
+    upstream = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    a, b = similarity(fast), similarity(slow)
+    torch.testing.assert_close(a, b, atol=2e-6, rtol=0)
+    (a * upstream).sum().backward()
+    (b * upstream).sum().backward()
+    assert fast.grad is not None
+    assert slow.grad is not None
+    torch.testing.assert_close(fast.grad[:2].double(), slow.grad[:2], atol=1e-6, rtol=1e-3)
+
+
+def test_gradient_equals_finite_differences() -> None:
+    similarity = grad_ncc(picture(9, 17, 15), 2)
+    image = picture(10, 17, 15)[None].double().requires_grad_()
+    torch.autograd.gradcheck(similarity, (image,), eps=1e-5, atol=1e-6)
+
+
+def test_a_batch_gives_what_each_image_gives_alone() -> None:
+    similarity = grad_ncc(picture(11), 3)
+    batch = torch.stack([picture(seed) for seed in range(5)])
+    alone = torch.cat([similarity(image[None]) for image in batch])
+    assert torch.equal(similarity(batch), alone)
+
+
+def test_weights_choose_where_images_are_compared() -> None:
+    fixed = picture(12)
+    moving = fixed.clone()
+    moving[:, 16:] = picture(13)[:, 16:]  # right half wrong
+    left = torch.zeros_like(fixed)
+    left[:, :9] = 1  # patches that touch it end before the wrong half
+    assert float(grad_ncc(fixed, 2, weights=left)(moving[None])) < 1e-5
+    assert float(grad_ncc(fixed, 2)(moving[None])) > 0.2
+
+
+@pytest.mark.parametrize(
+    ("weights", "radius", "says"),
+    [(torch.zeros(40, 33), 3, "all pixel weights are zero"), (None, 20, "no patch of radius 20 fits")],
+)
+def test_nothing_to_compare_is_said(weights: Tensor | None, radius: int, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        grad_ncc(picture(14), radius, weights=weights)
+
+
+def test_an_image_of_another_size_is_refused() -> None:
+    with pytest.raises(InputError, match="images are"):
+        grad_ncc(picture(15), 3)(torch.zeros(1, 8, 8))

@@ -1,0 +1,141 @@
+"""Landmark files in three formats, and all that may be wrong with them."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.volume import HIP_LANDMARKS, Volume, axis_aligned, check_inside, read_landmarks, write_landmarks
+
+HEAD, NOTCH = [97.3, -11.84, -78.18], [-78.68, 13.25, -23.23]  # FH-l is left (+x), GSN-r right, LPS
+RAS_HEAD, RAS_NOTCH = [-97.3, 11.84, -78.18], [78.68, -13.25, -23.23]
+
+
+def expected() -> dict[str, torch.Tensor]:
+    return {name: torch.tensor(p, dtype=torch.float64) for name, p in (("FH-l", HEAD), ("GSN-r", NOTCH))}
+
+
+def plain(**changes: Any) -> dict[str, Any]:
+    return {"space": "LPS", "unit": "mm", "landmarks": {"GSN-r": NOTCH, "FH-l": HEAD}} | changes
+
+
+def slicer(system: str, head: list[float], notch: list[float], **changes: Any) -> dict[str, Any]:
+    points = [
+        {"id": "1", "label": "GSN-r", "position": notch, "positionStatus": "defined"},
+        {"id": "2", "label": "FH-l", "position": head},
+        {"id": "3", "label": "FH-r", "position": [0, 0, 0], "positionStatus": "undefined"},
+    ]
+    return {"markups": [{"type": "Fiducial", "coordinateSystem": system, "controlPoints": points} | changes]}
+
+
+def fcsv(system: str, head: list[float], notch: list[float]) -> str:
+    lines = [
+        "# Markups fiducial file version = 4.11",
+        f"# CoordinateSystem = {system}",
+        "# columns = id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID",
+    ]
+    for name, point in (("GSN-r", notch), ("FH-l", head)):
+        lines.append(f"vtkMRML_{name},{','.join(map(str, point))},0,0,0,1,1,1,0,{name},,")
+    return "\n".join(lines) + "\n"
+
+
+FILES = {
+    "plain LPS.json": json.dumps(plain()),
+    "plain RAS.json": json.dumps(plain(space="RAS", landmarks={"FH-l": RAS_HEAD, "GSN-r": RAS_NOTCH})),
+    "slicer LPS.mrk.json": json.dumps(slicer("LPS", HEAD, NOTCH)),
+    "slicer RAS.mrk.json": json.dumps(slicer("RAS", RAS_HEAD, RAS_NOTCH)),
+    "LPS.fcsv": fcsv("LPS", HEAD, NOTCH),
+    "RAS.fcsv": fcsv("RAS", RAS_HEAD, RAS_NOTCH),
+    "old RAS.fcsv": fcsv("0", RAS_HEAD, RAS_NOTCH),
+    "old LPS.fcsv": fcsv("1", HEAD, NOTCH),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_all_formats_give_the_same_lps_points_in_the_same_order(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(FILES[name])
+    found = read_landmarks(tmp_path / name)
+    assert list(found) == ["FH-l", "GSN-r"]
+    for key, point in expected().items():
+        assert torch.equal(found[key], point)
+
+
+@pytest.mark.parametrize("name", ["points.json", "points.mrk.json"])
+def test_written_landmarks_come_back(tmp_path: Path, name: str) -> None:
+    values = torch.randn(14, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    points = dict(zip(HIP_LANDMARKS, values, strict=True))
+    write_landmarks(tmp_path / name, points)
+    again = read_landmarks(tmp_path / name)
+    assert tuple(again) == HIP_LANDMARKS
+    for key in points:
+        torch.testing.assert_close(again[key], points[key], atol=1e-8, rtol=0)
+
+
+BAD = {
+    "unknown name": (json.dumps(plain(landmarks={"FH-x": HEAD})), "unknown landmark 'FH-x'"),
+    "centimetres": (json.dumps(plain(unit="cm")), "unit must be mm, found 'cm'"),
+    "no unit": (json.dumps({"space": "LPS", "landmarks": {}}), "`unit` is missing"),
+    "no landmarks": (json.dumps({"space": "LPS", "unit": "mm"}), "`landmarks` is missing"),
+    "empty": (json.dumps(plain(landmarks={})), "holds no landmark"),
+    "a list": (json.dumps(plain(landmarks=[HEAD])), "an object of names and points"),
+    "space": (json.dumps(plain(space="LAS")), "LPS or RAS, found 'LAS'"),
+    "nan": ('{"space": "LPS", "unit": "mm", "landmarks": {"FH-l": [NaN, 0, 0]}}', "FH-l: three finite numbers"),
+    "two numbers": (json.dumps(plain(landmarks={"FH-l": [1, 2]})), "FH-l: three finite numbers"),
+    "words": (json.dumps(plain(landmarks={"FH-l": ["a", 0, 0]})), "FH-l: three finite numbers"),
+    "null": (json.dumps(plain(landmarks={"FH-l": None})), "FH-l: three finite numbers"),
+    "no json": ("FH-l 1 2 3", "cannot be read as JSON"),
+    "no object": ("[1, 2]", "a JSON object"),
+    "slicer unit": (json.dumps(slicer("LPS", HEAD, NOTCH, coordinateUnits="cm")), "unit must be mm"),
+    "slicer system": (json.dumps(slicer("IJK", HEAD, NOTCH)), "LPS or RAS, found 'IJK'"),
+    "slicer points": (json.dumps(slicer("LPS", HEAD, NOTCH, controlPoints=None)), "controlPoints"),
+    "slicer twice": (
+        json.dumps(slicer("LPS", HEAD, NOTCH, controlPoints=[{"label": "FH-l", "position": HEAD}] * 2)),
+        "FH-l stands there twice",
+    ),
+    "no markups": ('{"markups": []}', "markups"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_files(tmp_path: Path, kind: str) -> None:
+    content, message = BAD[kind]
+    (tmp_path / "points.json").write_text(content)
+    with pytest.raises(InputError, match=message) as raised:
+        read_landmarks(tmp_path / "points.json")
+    assert "points.json" in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("# CoordinateSystem = LPS", "# CoordinateSystem = 2"), "LPS or RAS, found '2'"),
+        (("# CoordinateSystem = LPS\n", ""), "LPS or RAS, found None"),
+        (("97.3", "left"), "FH-l: three finite numbers"),
+        (("0,FH-l,,", "0,Head,,"), "unknown landmark 'Head'"),
+    ],
+)
+def test_bad_fcsv(tmp_path: Path, change: tuple[str, str], message: str) -> None:
+    (tmp_path / "points.fcsv").write_text(fcsv("LPS", HEAD, NOTCH).replace(*change))
+    with pytest.raises(InputError, match=message):
+        read_landmarks(tmp_path / "points.fcsv")
+
+
+def test_a_missing_file_and_bytes_that_are_no_text(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_landmarks(tmp_path / "points.json")
+    for name in ("points.json", "points.fcsv"):
+        (tmp_path / name).write_bytes(b"\xff\xfe\x00\x80")
+        with pytest.raises(InputError, match="cannot be read"):
+            read_landmarks(tmp_path / name)
+
+
+def test_a_landmark_outside_the_ct_is_refused() -> None:
+    volume = Volume(torch.zeros(10, 20, 30), axis_aligned((2.0, 1.0, 1.0), (5.0, 0.0, 0.0)))
+    check_inside({"FH-l": torch.tensor([64.0, 19.4, 9.4], dtype=torch.float64)}, volume)
+    for point in ([64.1, 10.0, 5.0], [3.9, 10.0, 5.0], [20.0, 10.0, -0.6]):
+        with pytest.raises(InputError, match=r"FH-l .* outside the CT"):
+            check_inside({"FH-l": torch.tensor(point, dtype=torch.float64)}, volume)

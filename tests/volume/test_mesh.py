@@ -1,0 +1,79 @@
+"""Voxelised solids against their closed forms."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.volume import read_mesh, voxelise_mesh
+
+MU = 6000 * 2.6828e-5  # 5000 HU above air, 1/mm
+
+
+def test_a_ball_keeps_its_volume_place_and_attenuation() -> None:
+    ball = trimesh.creation.icosphere(5, 12.3)
+    ball.apply_translation([3.1, -40.2, 7.7])
+    volume = voxelise_mesh(ball, 0.5, 5000)
+    assert volume.spacing_mm == (0.5, 0.5, 0.5)
+    share = volume.data.double() / MU
+    assert share.max() == pytest.approx(1, abs=1e-6)
+    assert share.sum() * 0.5**3 == pytest.approx(4 / 3 * math.pi * 12.3**3, rel=3e-3)
+    z, y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in share.shape), indexing="ij")
+    points = torch.stack([x, y, z], -1) @ volume.lps_from_index[:3, :3].T + volume.lps_from_index[:3, 3]
+    radius = (points - torch.tensor([3.1, -40.2, 7.7], dtype=torch.float64)).norm(dim=-1)
+    half_diagonal = 0.5 * math.sqrt(3) / 2
+    assert (share[radius < 12.2 - half_diagonal] > 1 - 1e-6).all()
+    assert (share[radius > 12.3 + half_diagonal] == 0).all()
+    edge = (radius - 12.3).abs() < 0.05
+    assert share[edge].mean() == pytest.approx(0.5, abs=0.03)
+
+
+def test_edges_of_a_box_hold_the_share_that_is_inside() -> None:
+    box = trimesh.creation.box((10.0, 6.0, 4.4))
+    volume = voxelise_mesh(box, 1.0, 5000)
+    profile = volume.data[:, volume.data.shape[1] // 2, volume.data.shape[2] // 2] / MU
+    assert profile.sum() == pytest.approx(4.4, abs=1e-5)  # exact along z
+    assert (volume.data / MU).sum() == pytest.approx(10 * 6 * 4.4, rel=1e-4)
+
+
+def test_overlapping_solids_are_one_solid() -> None:
+    parts = trimesh.util.concatenate([trimesh.creation.box((10, 10, 10)), trimesh.creation.box((4, 4, 30))])
+    volume = voxelise_mesh(parts, 0.5, 5000)
+    assert (volume.data / MU).sum() * 0.125 == pytest.approx(1000 + 16 * 20, rel=1e-3)
+
+
+def test_inward_normals_are_turned(tmp_path: Path) -> None:
+    box = trimesh.creation.box((10, 6, 4))
+    box.invert()
+    box.export(tmp_path / "device.stl")
+    assert read_mesh(tmp_path / "device.stl").volume == pytest.approx(240)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "ply", "obj", "off"])
+def test_mesh_formats(tmp_path: Path, suffix: str) -> None:
+    trimesh.creation.icosphere(2, 5).export(tmp_path / f"device.{suffix}")
+    mesh = read_mesh(tmp_path / f"device.{suffix}")
+    assert np.allclose(mesh.extents, 10, atol=0.3)
+
+
+def test_an_open_mesh_is_refused(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(2, 5)
+    ball.update_faces(np.arange(len(ball.faces)) > 3)
+    ball.export(tmp_path / "device.stl")
+    with pytest.raises(InputError, match=r"device\.stl: the mesh is open"):
+        read_mesh(tmp_path / "device.stl")
+    with pytest.raises(InputError, match="open"):
+        voxelise_mesh(ball, 0.5, 5000)
+
+
+@pytest.mark.parametrize("content", [b"", b"solid nothing\nendsolid nothing\n", b"\x00\x01garbage" * 3])
+def test_what_is_no_mesh_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "device.stl").write_bytes(content)
+    with pytest.raises(InputError, match=r"device\.stl"):
+        read_mesh(tmp_path / "device.stl")
+    with pytest.raises(InputError, match="no such file"):
+        read_mesh(tmp_path / "other.stl")

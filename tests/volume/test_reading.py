@@ -1,0 +1,236 @@
+"""Volumes from files against SimpleITK's own index-to-point transform, and every way in which a file can be wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import SimpleITK as sitk  # noqa: N813 (its own documentation's name)
+import torch
+from scipy.spatial.transform import Rotation
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.volume import (
+    Volume,
+    axis_aligned,
+    check_inside,
+    read_ct,
+    read_labels,
+    read_landmarks,
+    structure_attenuation,
+    write_volume,
+)
+
+OBLIQUE = Rotation.from_euler("xyz", [12, -8, 20], degrees=True).as_matrix()
+RIGHT_HANDED = {
+    "LPS": np.eye(3),
+    "RAS": np.diag([-1.0, -1.0, 1.0]),
+    "RPI": np.diag([-1.0, 1.0, -1.0]),
+    "sagittal": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+    "oblique": OBLIQUE,
+    "oblique RAS": OBLIQUE @ np.diag([-1.0, -1.0, 1.0]),
+}
+BRIGHT = (2, 5, 4)  # x, y, z index of the one bright voxel
+
+
+def ct_image(direction: np.ndarray = RIGHT_HANDED["LPS"], dtype: type = np.int16) -> sitk.Image:
+    """A CT of air (8 × 9 × 7 voxels) with one voxel of bone."""
+    array = np.full((7, 9, 8), -1000, dtype)
+    array[BRIGHT[::-1]] = 1200
+    image = sitk.GetImageFromArray(array)
+    image.SetSpacing((0.8, 0.9, 2.5))
+    image.SetOrigin((-40.0, 13.0, 200.0))
+    image.SetDirection(direction.ravel().tolist())
+    return image
+
+
+def brightest_point(volume: Volume) -> np.ndarray:
+    z, y, x = np.unravel_index(int(volume.data.argmax()), volume.data.shape)
+    return (volume.lps_from_index @ torch.tensor([x, y, z, 1.0], dtype=torch.float64))[:3].numpy()
+
+
+@pytest.mark.parametrize("direction", RIGHT_HANDED.values(), ids=RIGHT_HANDED.keys())
+@pytest.mark.parametrize("suffix", [".nii.gz", ".mha", ".nrrd"])
+def test_every_index_order_ends_in_lps_with_its_points_in_place(
+    tmp_path: Path, direction: np.ndarray, suffix: str
+) -> None:
+    image = ct_image(direction)
+    sitk.WriteImage(image, str(tmp_path / f"ct{suffix}"))
+    volume = read_ct(tmp_path / f"ct{suffix}")
+    assert volume.data.dtype == torch.float32
+    np.testing.assert_allclose(brightest_point(volume), image.TransformIndexToPhysicalPoint(BRIGHT), atol=1e-3)
+    cosines = volume.lps_from_index[:3, :3] / torch.tensor(volume.spacing_mm)
+    assert (cosines.diagonal() > 0.8).all()  # index axes run along +L, +P, +S
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.float32, np.int16])
+def test_voxel_types(tmp_path: Path, dtype: type) -> None:
+    sitk.WriteImage(ct_image(dtype=dtype), str(tmp_path / "ct.nii.gz"))
+    assert read_ct(tmp_path / "ct.nii.gz").data.aminmax() == (-1000, 1200)
+
+
+def write_series(folder: Path, uid: str = "1.2.3") -> sitk.Image:
+    """The CT as a DICOM series whose files are named against the order of the slices."""
+    folder.mkdir(exist_ok=True)
+    image = ct_image()
+    writer = sitk.ImageFileWriter()
+    writer.KeepOriginalImageUIDOn()
+    for z in range(image.GetDepth()):
+        single = image[:, :, z]
+        for tag, value in {
+            "0008|0060": "CT",
+            "0008|0018": f"{uid}.{z + 1}",
+            "0020|000d": "1.2",
+            "0020|000e": uid,
+            "0020|0032": "\\".join(str(v) for v in image.TransformIndexToPhysicalPoint((0, 0, z))),
+            "0020|0037": "1\\0\\0\\0\\1\\0",
+            "0020|0013": str(z),
+            "0028|1052": "0",
+            "0028|1053": "1",
+        }.items():
+            single.SetMetaData(tag, value)
+        writer.SetFileName(str(folder / f"{uid}_{99 - z}.dcm"))
+        writer.Execute(single)
+    return image
+
+
+def test_dicom_series(tmp_path: Path) -> None:
+    image = write_series(tmp_path / "series")
+    volume = read_ct(tmp_path / "series")
+    assert tuple(volume.data.shape) == (7, 9, 8)
+    np.testing.assert_allclose(brightest_point(volume), image.TransformIndexToPhysicalPoint(BRIGHT), atol=1e-4)
+
+
+def test_real_headers(data_folder: Path) -> None:
+    """Three scans as found, with int32 and sform only, int16, and float with qform only."""
+    for name in ("totalsegmentator_hip_nail", "ibsi_sts_020", "ibsi_sts_044"):
+        volume = read_ct(data_folder / "ct" / f"{name}.nii.gz")
+        assert (volume.lps_from_index[:3, :3].diagonal() > 0).all()
+    nailed = read_ct(data_folder / "ct" / "totalsegmentator_hip_nail.nii.gz")
+    metal = (nailed.data > 2500).nonzero().double().mean(0).flip(0)
+    left_of_the_middle = nailed.lps_from_index[:3, :3] @ metal + nailed.lps_from_index[:3, 3] - nailed.centre()
+    assert left_of_the_middle[0] > 30  # the nail is in the left hip
+
+
+def damaged(kind: str, folder: Path) -> Path:
+    """A CT that is wrong in the way of `kind`."""
+    path = folder / "ct.nii.gz"
+    image = ct_image()
+    if kind == "text":
+        path.write_text("not an image")
+    elif kind == "flat":
+        sitk.WriteImage(image[:, :, 2], str(path))
+    elif kind == "mirrored":
+        sitk.WriteImage(ct_image(np.diag([1.0, -1.0, 1.0])), str(path))
+    elif kind == "nan":
+        array = sitk.GetArrayFromImage(ct_image(dtype=np.float32))
+        array[0, 0, 0] = np.nan
+        sitk.WriteImage(sitk.GetImageFromArray(array), str(path))
+    elif kind == "constant":
+        sitk.WriteImage(image * 0 + 3, str(path))
+    elif kind == "attenuation":
+        sitk.WriteImage((sitk.Cast(image, sitk.sitkFloat32) + 1000) * 2e-5, str(path))
+    elif kind == "unscaled":
+        sitk.WriteImage(image + 1024, str(path))
+    elif kind == "empty folder":
+        path = folder
+    elif kind == "two series":
+        path = folder / "series"
+        write_series(path, "1.2.3")
+        write_series(path, "1.2.4")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("missing", "no such file"),
+        ("text", "cannot be read"),
+        ("flat", "3-D volume"),
+        ("mirrored", "mirrored"),
+        ("nan", "not finite"),
+        ("constant", "every voxel is 3"),
+        ("attenuation", "Hounsfield"),
+        ("unscaled", "Hounsfield"),
+        ("empty folder", "no DICOM series"),
+        ("two series", "2 DICOM series"),
+    ],
+)
+def test_bad_ct(tmp_path: Path, kind: str, message: str) -> None:
+    path = damaged(kind, tmp_path)
+    with pytest.raises(InputError, match=message) as raised:
+        read_ct(path)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def label_image(direction: np.ndarray = RIGHT_HANDED["LPS"]) -> sitk.Image:
+    return sitk.Cast(ct_image(direction) > 0, sitk.sitkUInt8) * 5
+
+
+def test_labels_in_another_index_order_come_back_on_the_grid_of_the_ct(tmp_path: Path) -> None:
+    sitk.WriteImage(ct_image(OBLIQUE), str(tmp_path / "ct.nii.gz"))
+    sitk.WriteImage(sitk.DICOMOrient(label_image(OBLIQUE), "RAS"), str(tmp_path / "labels.nii.gz"))
+    ct = read_ct(tmp_path / "ct.nii.gz")
+    labels = read_labels(tmp_path / "labels.nii.gz", ct)
+    assert labels.data.dtype == torch.uint8
+    assert torch.equal(labels.data == 5, ct.data > 0)
+
+
+def wrong_labels(kind: str) -> sitk.Image:
+    labels = label_image()
+    if kind == "shape":
+        return labels[1:, :, :]
+    if kind == "shifted":
+        labels.SetOrigin((-40.0 + 0.4, 13.0, 200.0))
+    if kind == "turned":
+        labels.SetDirection(Rotation.from_euler("z", 1, degrees=True).as_matrix().ravel().tolist())
+    if kind == "fractions":
+        return sitk.Cast(labels, sitk.sitkFloat32) * 0.9
+    if kind == "negative":
+        return sitk.Cast(labels, sitk.sitkInt16) - 1
+    return labels
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("shape", r"7 × 9 × 7 voxels, but the CT has 8 × 9 × 7"),
+        ("shifted", "another grid"),
+        ("turned", "another grid"),
+        ("fractions", "whole numbers"),
+        ("negative", "whole numbers"),
+    ],
+)
+def test_bad_labels(tmp_path: Path, kind: str, message: str) -> None:
+    sitk.WriteImage(ct_image(), str(tmp_path / "ct.nii.gz"))
+    sitk.WriteImage(wrong_labels(kind), str(tmp_path / "labels.nii.gz"))
+    with pytest.raises(InputError, match=message):
+        read_labels(tmp_path / "labels.nii.gz", read_ct(tmp_path / "ct.nii.gz"))
+
+
+@pytest.mark.parametrize("suffix", [".nii.gz", ".mha", ".nrrd"])
+def test_written_volumes_come_back(tmp_path: Path, suffix: str) -> None:
+    affine = axis_aligned((0.8, 0.9, 2.5), (-40.0, 13.0, 200.0))
+    affine[:3, :3] = torch.from_numpy(OBLIQUE) @ affine[:3, :3]
+    data = torch.from_numpy(np.random.default_rng(1).integers(-1000, 1500, (7, 9, 8))).float()
+    write_volume(tmp_path / f"ct{suffix}", Volume(data, affine))
+    again = read_ct(tmp_path / f"ct{suffix}")
+    assert torch.equal(again.data, data)
+    torch.testing.assert_close(again.lps_from_index, affine, atol=1e-4, rtol=0)
+    assert [p.name for p in tmp_path.iterdir()] == [f"ct{suffix}"]
+
+
+def test_real_landmarks_lie_in_the_bones_of_their_side(data_folder: Path) -> None:
+    """CT, labels and landmarks of one patient, read by three readers, meet in space."""
+    folder = data_folder / "cases" / "bmf"
+    ct = read_ct(folder / "ct.nii.gz")
+    labels = read_labels(folder / "labels.nii.gz", ct)
+    landmarks = read_landmarks(folder / "landmarks.json")
+    check_inside(landmarks, ct)
+    for name, femur in (("FH-l", 5), ("FH-r", 6)):
+        x, y, z = torch.linalg.solve(ct.lps_from_index, torch.cat([landmarks[name], torch.ones(1)]))[:3].round().long()
+        assert labels.data[z, y, x] == femur
+    left = structure_attenuation(ct, labels, [5]).centre()
+    assert left[0] > 0  # patient left is +x
+    assert landmarks["ASIS-l"][1] < landmarks["GSN-l"][1]  # back is +y
+    assert landmarks["ASIS-l"][2] > landmarks["IPS-l"][2]  # up is +z

@@ -1,0 +1,71 @@
+"""Crops and resampled volumes against a field that is known everywhere in space."""
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.volume import Volume, axis_aligned, crop, resample_isotropic
+
+GRADIENT = torch.tensor([1.5, -0.7, 0.4], dtype=torch.float64)  # HU per mm of L, P, S
+
+
+def positions(volume: Volume) -> Tensor:
+    """LPS (Z, Y, X, 3) of all voxel centres."""
+    z, y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in volume.data.shape), indexing="ij")
+    return torch.stack([x, y, z], -1) @ volume.lps_from_index[:3, :3].T + volume.lps_from_index[:3, 3]
+
+
+def ramp() -> Volume:
+    """A field that is linear in LPS on an oblique grid of unequal spacing."""
+    affine = axis_aligned((0.7, 0.5, 1.6), (-20.0, 10.0, 300.0))
+    turn = Rotation.from_euler("xyz", [10, 20, -5], degrees=True).as_matrix()
+    affine[:3, :3] = torch.from_numpy(turn) @ affine[:3, :3]
+    empty = Volume(torch.zeros(20, 31, 24), affine)
+    return empty.with_data((positions(empty) @ GRADIENT).float())
+
+
+def test_crop_keeps_values_at_their_places() -> None:
+    part = crop(ramp(), (3, -5, 2), (9, 11, 99))
+    assert tuple(part.data.shape) == (18, 11, 6)
+    torch.testing.assert_close(part.data, (positions(part) @ GRADIENT).float())
+
+
+def test_an_empty_crop_is_refused() -> None:
+    with pytest.raises(InputError, match="no voxel"):
+        crop(ramp(), (30, 0, 0), (40, 5, 5))
+
+
+@pytest.mark.parametrize("spacing_mm", [0.5, 1.0, 1.37, 2.5])
+def test_resampling_keeps_a_linear_field_in_place(spacing_mm: float) -> None:
+    volume = resample_isotropic(ramp(), spacing_mm)
+    assert volume.spacing_mm == pytest.approx((spacing_mm,) * 3)
+    inside = tuple(slice(n // 4, n - n // 4) for n in volume.data.shape)  # values at the faces are repeated outwards
+    expected = (positions(volume) @ GRADIENT).float()
+    tolerance_mm = 0.03 * spacing_mm  # the filter is a triangle in samples, whose mean is not quite its centre
+    torch.testing.assert_close(volume.data[inside], expected[inside], atol=1.7 * tolerance_mm, rtol=0)
+
+
+def test_resampling_keeps_the_outer_face_of_the_first_voxel() -> None:
+    old, new = ramp(), resample_isotropic(ramp(), 1.0)
+    corner = torch.tensor([-0.5, -0.5, -0.5, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(new.lps_from_index @ corner, old.lps_from_index @ corner)
+
+
+def test_coarser_voxels_are_averages_and_not_samples() -> None:
+    board = (torch.arange(40)[:, None, None] + torch.arange(40)[:, None] + torch.arange(40)) % 2 * 1000.0
+    coarse = resample_isotropic(Volume(board, axis_aligned((0.5, 0.5, 0.5), (0.0, 0.0, 0.0))), 1.0)
+    torch.testing.assert_close(coarse.data[2:-2, 2:-2, 2:-2], torch.full((16, 16, 16), 500.0))
+
+
+def test_labels_stay_labels() -> None:
+    random = torch.rand(10, 10, 10, generator=torch.Generator().manual_seed(0))
+    fine = resample_isotropic(Volume((random > 0.5).to(torch.uint8) * 5, ramp().lps_from_index), 0.4, nearest=True)
+    assert fine.data.dtype == torch.uint8
+    assert set(fine.data.unique().tolist()) == {0, 5}
+
+
+def test_voxels_larger_than_the_volume_are_refused() -> None:
+    with pytest.raises(InputError, match="larger than the whole volume"):
+        resample_isotropic(ramp(), 40.0)

@@ -1,0 +1,226 @@
+"""Fluoroscopy out of stored layers: appearance and geometry are drawn anew for every image.
+
+All functions work on batches and take the torch generator they draw from. The physics is a sketch made for variety:
+Beer-Lambert, scatter as a blurred share of the primary beam, Poisson noise, detector blur and saturation.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from kornia.filters import gaussian_blur2d
+from kornia.geometry.transform import warp_affine
+from torch import Generator, Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.detect import normalise
+
+_SWAPPED_LABELS = torch.tensor([0, 2, 1, 3, 4, 6, 5], dtype=torch.uint8)
+_SWAPPED_LANDMARKS = torch.arange(14).view(7, 2).flip(1).flatten()  # -l and -r stand in pairs
+
+
+@dataclass(frozen=True)
+class AugmentationSettings:
+    """Ranges of the uniform draws, and shares of the images that something happens to."""
+
+    tissue: tuple[float, float] = (0.4, 0.9)  # factor of soft tissue's attenuation
+    bone: tuple[float, float] = (0.5, 1.5)  # factor of bone's attenuation above soft tissue: density
+    bone_spread: float = 0.2  # and of each bone by itself
+    unevenness: float = 0.5  # peak of a smooth random field added to the attenuation
+    instrument_share: float = 0.35
+    scatter: tuple[float, float] = (0.0, 0.6)  # relative to the mean of the primary beam
+    photons: tuple[float, float] = (100.0, 20000.0)  # per pixel of the network's grid at the mean; log-uniform
+    blur_px: tuple[float, float] = (0.01, 1.2)
+    saturation_share: float = 0.3
+    gamma: tuple[float, float] = (0.6, 1.7)
+    inverted_share: float = 0.03
+    collimated_share: float = 0.25
+    erased_share: float = 0.2
+    rotation_deg: float = 12.0
+    scale: tuple[float, float] = (0.85, 1.15)
+    shift_px: float = 20.0
+    flipped_share: float = 0.5
+
+
+class Batch(NamedTuple):
+    """What the network is trained on: images on its grid, truth on the grid of its output (half as fine)."""
+
+    images: Tensor  # (B, 1, 192, 192), normalised
+    labels: Tensor  # (B, 96, 96) uint8
+    landmarks: Tensor  # (B, 14, 2) column, row
+    visible: Tensor  # (B, 14) bool
+
+
+def _uniform(low: float, high: float, shape: tuple[int, ...], generator: Generator) -> Tensor:
+    return low + (high - low) * torch.rand(shape, generator=generator)
+
+
+def _chosen(share: float, count: int, generator: Generator) -> Tensor:
+    return torch.rand((count, 1, 1), generator=generator) < share
+
+
+def compose(tissue: Tensor, bones: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:
+    """Attenuation (B, H, W) of weighted layers: `tissue` (B, H / 2, W / 2), `bones` (B, 6, H, W)."""
+    count = len(tissue)
+    soft = F.interpolate(tissue.float()[:, None], scale_factor=2, mode="bilinear")[:, 0]
+    spread = _uniform(1 - settings.bone_spread, 1 + settings.bone_spread, (count, 6, 1, 1), generator)
+    density = _uniform(*settings.bone, (count, 1, 1), generator)
+    field = F.interpolate(torch.randn((count, 1, 4, 4), generator=generator), soft.shape[1:], mode="bicubic")[:, 0]
+    unevenness = _uniform(0, settings.unevenness, (count, 1, 1), generator) * field
+    bone = (bones.float() * spread).sum(1) * density
+    return soft * _uniform(*settings.tissue, (count, 1, 1), generator) + bone + unevenness
+
+
+def flip_sides(images: Tensor, labels: Tensor, landmarks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The mirrored patient: images (..., W), labels and (column, row) landmarks, with left and right exchanged.
+
+    `landmarks` are in pixels of the images.
+    """
+    swapped = landmarks[..., _SWAPPED_LANDMARKS, :].clone()
+    swapped[..., 0] = images.shape[-1] - 1 - swapped[..., 0]
+    return images.flip(-1), _SWAPPED_LABELS[labels.flip(-1).long()], swapped
+
+
+def inside(landmarks: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Which (column, row) positions (..., 2) lie on an image of `shape` (rows, columns)."""
+    column, row = landmarks.unbind(-1)
+    return (column >= -0.5) & (column <= shape[1] - 0.5) & (row >= -0.5) & (row <= shape[0] - 0.5)
+
+
+def random_affine(count: int, size: int, settings: AugmentationSettings, generator: Generator) -> Tensor:
+    """`new_from_old` (B, 3, 3) in pixels of a square image: turn and scale about its middle, then shift."""
+    angle = _uniform(-1, 1, (count,), generator) * math.radians(settings.rotation_deg)
+    scale = _uniform(*settings.scale, (count,), generator)
+    c, s = scale * angle.cos(), scale * angle.sin()
+    linear = torch.stack([c, -s, s, c], -1).view(count, 2, 2)
+    middle = (size - 1) / 2
+    shift = _uniform(-settings.shift_px, settings.shift_px, (count, 2), generator)
+    affine = torch.eye(3).repeat(count, 1, 1)
+    affine[:, :2, :2] = linear
+    affine[:, :2, 2] = middle + shift - linear.sum(-1) * middle
+    return affine
+
+
+def move(images: Tensor, labels: Tensor, landmarks: Tensor, affine: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Images (B, H, W), labels on every second pixel and landmarks (B, L, 2), all moved by `affine` in image pixels."""
+    shape = (images.shape[1], images.shape[2])
+    moved = warp_affine(images[:, None], affine[:, :2], shape, padding_mode="border", align_corners=True)[:, 0]
+    fine_from_coarse = torch.tensor([[2.0, 0, 0.5], [0, 2.0, 0.5], [0, 0, 1]])
+    coarse = torch.linalg.inv(fine_from_coarse) @ affine @ fine_from_coarse
+    half = (labels.shape[1], labels.shape[2])
+    moved_labels = warp_affine(labels[:, None].float(), coarse[:, :2], half, mode="nearest", align_corners=True)
+    points = landmarks @ affine[:, :2, :2].mT + affine[:, None, :2, 2]
+    return moved, moved_labels[:, 0].round().to(torch.uint8), points
+
+
+def add_instruments(attenuation: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:
+    """Up to three straight metal rods in some of the images (B, H, W)."""
+    count, height, width = attenuation.shape
+    row, column = torch.meshgrid(torch.arange(height).float(), torch.arange(width).float(), indexing="ij")
+    chosen = _chosen(settings.instrument_share, count, generator)
+    for _ in range(3):
+        there = chosen & _chosen(0.6, count, generator)
+        start, end = (_uniform(-0.2 * width, 1.2 * width, (count, 2, 1, 1), generator) for _ in range(2))
+        along = end - start
+        from_start = torch.stack([column, row]) - start
+        share = ((from_start * along).sum(1) / (along**2).sum(1)).clamp(0, 1)[:, None]
+        distance = ((from_start - share * along) ** 2).sum(1).sqrt()
+        radius = torch.exp(_uniform(math.log(0.8), math.log(12.0), (count, 1, 1), generator))
+        depth = torch.exp(_uniform(math.log(0.2), math.log(4.0), (count, 1, 1), generator))
+        # chord of a round rod, with half a pixel of blur at its rim
+        chord = ((radius + 0.5 - distance).clamp_min(0) / (radius + 0.5)).sqrt()
+        attenuation = attenuation + there * depth * chord
+    return attenuation
+
+
+def expose(attenuation: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:
+    """Attenuation (B, H, W) as a detector would show it: scatter, noise, blur, saturation."""
+    count = len(attenuation)
+    primary = torch.exp(-attenuation.clamp_min(0))
+    primary = primary / primary.mean((1, 2), keepdim=True)
+    coarse = F.avg_pool2d(primary[:, None], 8)
+    spread = F.interpolate(gaussian_blur2d(coarse, (7, 7), (3.0, 3.0)), primary.shape[1:], mode="bilinear")[:, 0]
+    beam = primary + _uniform(*settings.scatter, (count, 1, 1), generator) * spread
+    low, high = (math.log(v) for v in settings.photons)
+    photons = torch.exp(_uniform(low, high, (count, 1, 1), generator))
+    signal = torch.poisson(beam * photons, generator=generator)[:, None]
+    sigma = _uniform(*settings.blur_px, (count, 1), generator).expand(count, 2)
+    signal = gaussian_blur2d(signal, (7, 7), sigma)[:, 0] / photons
+    ceiling = torch.quantile(signal.flatten(1), 0.5, dim=1)[:, None, None] * _uniform(1.5, 6, (count, 1, 1), generator)
+    signal = torch.where(_chosen(settings.saturation_share, count, generator), signal.minimum(ceiling), signal)
+    return -torch.log(signal.clamp_min(0.3 / photons))
+
+
+def alter_contrast(images: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:
+    """Gamma of the grey values between each image's extremes, and rarely an inversion."""
+    count = len(images)
+    low, high = images.amin((1, 2), keepdim=True), images.amax((1, 2), keepdim=True)
+    gamma = torch.exp(_uniform(*(math.log(v) for v in settings.gamma), (count, 1, 1), generator))
+    grey = ((images - low) / (high - low).clamp_min(1e-6)) ** gamma
+    return torch.where(_chosen(settings.inverted_share, count, generator), 1 - grey, grey)
+
+
+def collimate(
+    images: Tensor, labels: Tensor, landmarks: Tensor, visible: Tensor, share: float, generator: Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Some images (B, H, W) cut down to a rectangle or a disc; what lies outside is neither labelled nor visible."""
+    count, height, width = images.shape
+    chosen = _chosen(share, count, generator)
+    middle = _uniform(0.42, 0.58, (count, 2, 1, 1), generator) * width
+    half = _uniform(0.32, 0.5, (count, 2, 1, 1), generator) * width
+    round_field = _chosen(0.5, count, generator)
+
+    def covered(column: Tensor, row: Tensor) -> Tensor:
+        x, y = ((v - middle[:, n]) / half[:, n] for n, v in enumerate((column, row)))
+        return chosen & torch.where(round_field, x**2 + y**2 > 1, torch.maximum(x.abs(), y.abs()) > 1)
+
+    row, column = torch.meshgrid(torch.arange(height).float(), torch.arange(width).float(), indexing="ij")
+    shadow = covered(column[None], row[None])
+    level = torch.where(_chosen(0.5, count, generator), images.amax((1, 2), True), images.amin((1, 2), True))
+    hidden = covered(landmarks[:, :, 0][:, None], landmarks[:, :, 1][:, None])[:, 0]
+    return (
+        torch.where(shadow, level, images),
+        labels.masked_fill(shadow[:, ::2, ::2], 0),
+        visible & ~hidden,
+    )
+
+
+def erase_boxes(images: Tensor, share: float, generator: Generator) -> Tensor:
+    """Two boxes of constant grey in some of the images (B, H, W)."""
+    count, height, width = images.shape
+    row, column = torch.meshgrid(torch.arange(height).float(), torch.arange(width).float(), indexing="ij")
+    chosen = _chosen(share, count, generator)
+    for _ in range(2):
+        middle = _uniform(0, width, (count, 2, 1, 1), generator)
+        half = _uniform(4, 20, (count, 2, 1, 1), generator)
+        box = ((column - middle[:, 0]).abs() < half[:, 0]) & ((row - middle[:, 1]).abs() < half[:, 1])
+        grey = _uniform(0, 1, (count, 1, 1), generator)
+        images = torch.where(chosen & box, grey, images)
+    return images
+
+
+def make_batch(
+    tissue: Tensor,
+    bones: Tensor,
+    labels: Tensor,
+    landmarks: Tensor,
+    settings: AugmentationSettings,
+    generator: Generator,
+) -> Batch:
+    """Training images from stored layers (shapes as in `sim.dataset`, with N = B views)."""
+    images = compose(tissue, bones, settings, generator)
+    count, shape = len(images), (images.shape[1], images.shape[2])
+    flipped = flip_sides(images, labels, landmarks)
+    mirror = _chosen(settings.flipped_share, count, generator)
+    images = torch.where(mirror, flipped[0], images)
+    labels = torch.where(mirror, flipped[1], labels)
+    landmarks = torch.where(mirror, flipped[2], landmarks)
+    visible = inside(landmarks, shape)
+    images, labels, landmarks = move(images, labels, landmarks, random_affine(count, shape[0], settings, generator))
+    visible &= inside(landmarks, shape)
+    images = expose(add_instruments(images, settings, generator), settings, generator)
+    images = alter_contrast(images, settings, generator)
+    images, labels, visible = collimate(images, labels, landmarks, visible, settings.collimated_share, generator)
+    images = erase_boxes(images, settings.erased_share, generator)
+    return Batch(normalise(images)[:, None], labels, (landmarks - 0.5) / 2, visible)

@@ -1,0 +1,106 @@
+"""The patients that a network learns from, rendered once into a cache of labelled views."""
+
+import json
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+from safetensors import safe_open
+
+from femoreg_torch.detect import network_camera
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import load_carm
+from femoreg_torch.volume import read_ct, read_labels, read_landmarks
+from sim.dataset import write_views
+from sim.layers import Layers, deform, smooth_displacement, split_layers
+from sim.views import ViewRanges
+
+
+@dataclass(frozen=True)
+class CohortSettings:
+    """Who is rendered, how often and how."""
+
+    patient_seeds: list[int]  # procedural patients to train on
+    validation_seeds: list[int]  # procedural patients that only early stopping and the learning curve see
+    patient_spacing_mm: float = 1.5
+    patient_variants: int = 4  # smooth deformations of each procedural patient, the patient itself being the first
+    case_variants: int = 30  # and of each case folder given
+    views: int = 40  # per variant
+    deformation_mm: float = 4.0  # standard deviation of the displacement along each axis
+    carm: str = "cios_fusion"
+    seed: int = 1
+    ranges: ViewRanges = field(default_factory=ViewRanges)
+
+
+def render_cohort(
+    settings: CohortSettings, cases: Sequence[Path], cache: Path, report: Callable[[str], None]
+) -> tuple[list[Path], list[Path]]:
+    """Files of labelled views to train on and to validate on, rendered into `cache` unless they are there.
+
+    `cases` are folders with ct.nii.gz, labels.nii.gz and landmarks.json. Raises `InputError` if the cache holds views
+    made with other settings.
+    """
+    cache.mkdir(parents=True, exist_ok=True)
+    training: list[Path] = []
+    for case in cases:
+        name = case.resolve().name
+        training += _variants(settings, cache, name, settings.case_variants, lambda case=case: _read_case(case), report)
+    for seed in settings.patient_seeds:
+        source = _patient(seed, settings)
+        training += _variants(settings, cache, f"patient{seed}", settings.patient_variants, source, report)
+    validation: list[Path] = []
+    for seed in settings.validation_seeds:
+        validation += _variants(settings, cache, f"patient{seed}", 1, _patient(seed, settings), report)
+    return training, validation
+
+
+def _read_case(folder: Path) -> Layers:
+    ct = read_ct(folder / "ct.nii.gz")
+    labels = read_labels(folder / "labels.nii.gz", ct)
+    return split_layers(ct, labels, read_landmarks(folder / "landmarks.json"))
+
+
+def _patient(seed: int, settings: CohortSettings) -> Callable[[], Layers]:
+    def make() -> Layers:
+        from sim.patient import make_patient
+
+        patient = make_patient(seed, settings.patient_spacing_mm)
+        return split_layers(patient.ct, patient.labels, patient.landmarks)
+
+    return make
+
+
+def _variants(
+    settings: CohortSettings,
+    cache: Path,
+    name: str,
+    count: int,
+    load: Callable[[], Layers],
+    report: Callable[[str], None],
+) -> list[Path]:
+    files = [cache / f"{name}_{variant:02d}.safetensors" for variant in range(count)]
+    how = {k: v for k, v in asdict(settings).items() if k in ("views", "deformation_mm", "carm", "seed", "ranges")}
+    source = json.dumps({"patient": name, **how})
+    for file in files:
+        if file.exists():
+            _check_source(file, source)
+    missing = [variant for variant, file in enumerate(files) if not file.exists()]
+    if not missing:
+        return files
+    layers = load()
+    camera = network_camera(load_carm(settings.carm).camera)
+    for variant in missing:
+        rng = np.random.default_rng([settings.seed, zlib.crc32(name.encode()), variant])
+        patient = deform(layers, smooth_displacement(rng, settings.deformation_mm)) if variant else layers
+        write_views(files[variant], patient, settings.ranges, camera, settings.views, rng, source)
+        report(f"rendered {settings.views} views of {name}, variant {variant + 1} of {count}")
+    return files
+
+
+def _check_source(file: Path, source: str) -> None:
+    with safe_open(file, "pt") as content:
+        found = content.metadata().get("source")
+    if found != source:
+        raise InputError(f"{file}: rendered with other settings ({found}). Choose an empty cache folder.")

@@ -1,0 +1,91 @@
+"""The Lightning module: the network, its losses, and how it learns."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from lightning import LightningModule
+from torch import Tensor
+
+from models.losses import landmark_log_probabilities, multi_task_loss
+from models.unet import Prediction, UNet, UNetConfig
+from training.augmentation import Batch
+
+
+@dataclass(frozen=True)
+class OptimisationSettings:
+    """AdamW with warm-up and cosine decay over `epochs` of `batches_per_epoch` batches each."""
+
+    epochs: int
+    batches_per_epoch: int = 250
+    validation_batches: int = 15
+    batch_size: int = 8
+    learning_rate: float = 2e-3
+    weight_decay: float = 1e-3
+    warm_up: float = 0.05  # share of all steps
+    sigma_px: float = 1.5  # of the heat-map target on the network's output grid (3.1 mm pixels)
+    landmark_weight: float = 0.5
+    averaging: float = 0.998  # decay of the moving average of the weights that is validated and exported
+
+
+def landmark_errors_px(prediction: Prediction, landmarks: Tensor, visible: Tensor) -> Tensor:
+    """Distance (N,) from the highest pixel of the heat map to each visible landmark, in output pixels."""
+    width = prediction.heatmaps.shape[3]
+    best = prediction.heatmaps.flatten(2).argmax(-1)
+    found = torch.stack([best % width, best // width], -1)
+    return (found - landmarks).norm(dim=-1)[visible]
+
+
+class HipTraining(LightningModule):
+    """Trains a `UNet` on `Batch`es; logs losses, landmark errors, visibility and overlap."""
+
+    def __init__(self, network: UNetConfig, settings: OptimisationSettings) -> None:
+        super().__init__()
+        self.network = UNet(network).to(memory_format=torch.channels_last)
+        self.settings = settings
+
+    def _losses(self, batch: Batch) -> tuple[Prediction, dict[str, Tensor]]:
+        prediction = self.network(batch.images)
+        losses = multi_task_loss(
+            prediction,
+            batch.labels,
+            batch.landmarks,
+            batch.visible,
+            self.settings.sigma_px,
+            self.settings.landmark_weight,
+        )
+        return prediction, losses
+
+    def training_step(self, batch: Batch, _: int) -> Tensor:
+        _, losses = self._losses(batch)
+        self.log_dict({f"train/{name}": value for name, value in losses.items()}, batch_size=len(batch.images))
+        return losses["loss"]
+
+    def validation_step(self, batch: Batch, _: int) -> None:
+        prediction, losses = self._losses(batch)
+        absent = landmark_log_probabilities(prediction.heatmaps, prediction.absence)[..., -1].exp()
+        correct = ((absent < 0.5) == batch.visible).float().mean()
+        overlap = (prediction.segmentation.argmax(1) == batch.labels).float().mean()
+        values = {f"validation/{name}": value for name, value in losses.items()}
+        errors = landmark_errors_px(prediction, batch.landmarks, batch.visible)
+        values |= {
+            "validation/landmark_median_px": errors.median(),
+            "validation/landmark_within_2px": (errors < 2).float().mean(),
+            "validation/visibility": correct,
+            "validation/pixel_accuracy": overlap,
+        }
+        self.log_dict(values, batch_size=len(batch.images), prog_bar=True)
+
+    def configure_optimizers(self) -> dict[str, object]:
+        s = self.settings
+        optimiser = torch.optim.AdamW(self.parameters(), s.learning_rate, weight_decay=s.weight_decay)
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, self._rate)
+        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _rate(self, step: int) -> float:
+        """Linear warm-up, then half a cosine down to one per cent, relative to the learning rate."""
+        done = step / (self.settings.epochs * self.settings.batches_per_epoch)
+        warm_up = self.settings.warm_up
+        if done < warm_up:
+            return max(done, 1e-6) / warm_up
+        return 0.01 + 0.495 * (1 + math.cos(math.pi * min(1.0, (done - warm_up) / (1 - warm_up))))

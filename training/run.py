@@ -1,0 +1,109 @@
+"""One training run from settings to exported weights."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from lightning import Trainer, seed_everything
+from lightning.pytorch.callbacks import EMAWeightAveraging, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from rich.console import Console
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import temporary_file, write_json
+from models.unet import UNet
+from models.weights import SHIPPED_WEIGHTS, load_weights, save_weights
+from training.cohort import render_cohort
+from training.data import ViewData
+from training.module import HipTraining
+from training.settings import TrainingSettings
+
+_MONITORED = "validation/loss"
+
+
+def train_network(
+    settings: TrainingSettings,
+    cases: Sequence[Path],
+    out: Path,
+    cache: Path,
+    start: Path | None = None,
+    resume: bool = False,
+) -> Path:
+    """Render what is missing in `cache`, train, and return the path of the exported weights in `out`.
+
+    The weights exported are the ones of lowest validation loss or, without patients to validate on, the last ones.
+    `start` names weights to begin with. Raises `InputError` if `out` holds a run already and `resume` is false, or has
+    none to resume, or if `start` does not fit.
+    """
+    console = Console()
+    last = out / "checkpoints" / "last.ckpt"
+    if resume and not last.is_file():
+        raise InputError(f"{last}: no such file, so there is nothing to resume. Leave out --resume.")
+    if last.is_file() and not resume:
+        raise InputError(f"{out}: holds a training run. Continue it with --resume, or choose another folder.")
+    torch.set_num_threads(settings.threads)
+    training, validation = render_cohort(settings.cohort, cases, cache, console.print)
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "settings.json", {**asdict(settings), "cases": [case.resolve().name for case in cases]})
+    seed_everything(settings.seed)
+    optimisation = settings.optimisation
+    data = ViewData(
+        training,
+        validation,
+        settings.augmentation,
+        optimisation.batch_size,
+        optimisation.batches_per_epoch,
+        optimisation.validation_batches,
+        settings.workers,
+        settings.seed,
+    )
+    module = HipTraining(settings.network, optimisation)
+    if start is not None and not resume:
+        module.network.load_state_dict(_start_weights(start, module.network).state_dict())
+    best = ModelCheckpoint(
+        out / "checkpoints",
+        "best",
+        monitor=_MONITORED if validation else None,
+        save_last=True,
+        enable_version_counter=False,
+    )
+    trainer = Trainer(
+        accelerator="cpu",
+        max_epochs=optimisation.epochs,
+        reload_dataloaders_every_n_epochs=1,
+        logger=[CSVLogger(out, "csv", version=""), TensorBoardLogger(out, "tensorboard", version="")],
+        callbacks=[best, EMAWeightAveraging(decay=optimisation.averaging), RichProgressBar(refresh_rate=25)],
+        enable_model_summary=False,
+        log_every_n_steps=25,
+        limit_val_batches=1.0 if validation else 0,
+    )
+    trainer.fit(module, data, ckpt_path=last if resume else None)
+    return export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
+
+
+def _start_weights(path: Path, network: UNet) -> UNet:
+    try:
+        start = load_weights(path)
+    except (OSError, ValueError) as error:
+        raise InputError(str(error)) from error
+    if start.config != network.config:
+        raise InputError(f"{path}: these weights are of {start.config}, but the settings ask for {network.config}.")
+    return start
+
+
+def export_weights(checkpoint: Path, settings: TrainingSettings, path: Path) -> Path:
+    """Write the averaged weights of a checkpoint as safetensors."""
+    content = torch.load(checkpoint, weights_only=True)
+    module = HipTraining(settings.network, settings.optimisation)
+    module.load_state_dict(content["state_dict"])
+    about = {"step": str(content["global_step"]), "seed": str(settings.seed), "data": json.dumps(_data(settings))}
+    with temporary_file(path) as part:
+        save_weights(part, module.network, about)
+    return path
+
+
+def _data(settings: TrainingSettings) -> dict[str, object]:
+    """What the weights have seen, for the metadata."""
+    return {key: value for key, value in asdict(settings.cohort).items() if key != "ranges"}
