@@ -8,12 +8,23 @@ Every row is measured in a process of its own. Writes benchmarks/RESULTS.md and 
 
 import argparse
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from matplotlib.figure import Figure
-from measure import RESULTS, Timing, in_own_process, machine, measure, missing, table, write_section
+from measure import (
+    RESULTS,
+    Timing,
+    in_own_process,
+    machine,
+    measure,
+    missing,
+    resident_mib,
+    table,
+    write_section,
+)
 from renderers import RENDERERS
 from scene import CAMERA, default_case, pelvis, poses
 from torch import Tensor
@@ -21,7 +32,7 @@ from torch import Tensor
 from femoreg_torch.drr import project, project_with_jacobian
 from femoreg_torch.drr.reference import march
 from femoreg_torch.geometry import Camera, load_carm
-from femoreg_torch.volume.grid import Volume
+from femoreg_torch.volume.grid import Volume, axis_aligned
 
 _COARSE = CAMERA.window(
     slice(4, None, 8), slice(4, None, 8)
@@ -46,12 +57,11 @@ def run_row(scene: Path, name: str, task: str, count: int, device: str, seconds:
     stored = torch.load(scene, weights_only=True)
     volume = Volume(stored["data"], stored["lps_from_index"])
     many = poses(volume, count)
-    title, render = RENDERERS[name][1](volume, CAMERA, device)
     weights = torch.randn(count, *CAMERA.shape, generator=torch.Generator().manual_seed(1)).to(device)
 
-    def forward(candidates: Tensor = many) -> Tensor:
+    def forward() -> Tensor:
         with torch.no_grad():
-            return render(candidates)
+            return render(many)
 
     def gradient() -> None:
         moving = many.clone().requires_grad_()
@@ -60,17 +70,26 @@ def run_row(scene: Path, name: str, task: str, count: int, device: str, seconds:
     def jacobian() -> None:
         project_with_jacobian(volume, many, CAMERA, torch.tensor([0, 0, 800.0], dtype=torch.float64))
 
-    # compiles what is to be compiled, on a small image
-    _, small = RENDERERS[name][1](volume, CAMERA.downsampled(16), device)
-    (small(many[:1].clone().requires_grad_())).sum().backward()
-    if task == "jacobian":
-        project_with_jacobian(volume, many[:1], CAMERA.downsampled(16), torch.zeros(3, dtype=torch.float64))
-    timing = measure({"forward": forward, "gradient": gradient, "jacobian": jacobian}[task], device, seconds)
+    warm_up(name, device)
+    before = resident_mib(device)
+    title, render = RENDERERS[name][1](volume, CAMERA, device)
+    calls: dict[str, Callable[[], object]] = {"forward": forward, "gradient": gradient, "jacobian": jacobian}
+    timing = measure(calls[task], device, seconds, before)
     error = None
     if task == "forward" and count == 1:
         gap = forward()[0, 4::8, 4::8].cpu().double() - stored["march"]
         error = (gap.square().mean().sqrt() / stored["march"].square().mean().sqrt()).item()
     return Row(title, task, count, timing, error)
+
+
+def warm_up(name: str, device: str) -> None:
+    """Load and compile what a renderer needs, on a small volume and image."""
+    camera = CAMERA.downsampled(16)
+    small = Volume(torch.ones(8, 8, 8), axis_aligned((20.0, 20.0, 20.0), (-70.0, -70.0, -70.0)))
+    pose = poses(small, 1).requires_grad_()
+    RENDERERS[name][1](small, camera, device)[1](pose).sum().backward()
+    if device == "cpu":
+        project_with_jacobian(small, pose.detach(), camera, torch.zeros(3, dtype=torch.float64))
 
 
 def store_scene(volume: Volume, path: Path) -> None:
@@ -181,13 +200,14 @@ def main() -> None:
     peers = [p for p in ("nanodrr", "diffdrr") if missing(p) is None]
     grow = ", ".join(f"{side}²: {t:.3g}" for side, t in zip(_SIDES, sides, strict=True))
     batch = ", ".join(f"{n}: {t / n:.3g}" for n, t in zip(_BATCHES, batches, strict=True))
+    pixel = f"{CAMERA.shape[0]} × {CAMERA.shape[1]} pixels of {CAMERA.pixel_mm[0]:g} mm"
+    voxel = f"{size} voxels of {' × '.join(f'{s:.3g}' for s in volume.spacing_mm)} mm"
     text = f"""{machine(options.device, peers)}
 
-{CAMERA.shape[0]} × {CAMERA.shape[1]} pixels of {CAMERA.pixel_mm[0]:g} mm, {name}, {size} voxels of
-{" × ".join(f"{s:.3g}" for s in volume.spacing_mm)} mm, {options.device}, float32. `gradient` is forward and backward to the poses, `jacobian`
-the image and its six derivatives. Peak memory is what the call adds to a process that holds the volume. NRMSE is the
-root mean square difference over 2,304 pixels, divided by the root mean square of the march; Siddon's volume is constant
-within voxels, so that its difference is one of model.
+{pixel}, {name}, {voxel}, {options.device}, float32.
+`gradient` is forward and backward to the poses, `jacobian` the image and its six derivatives. Peak memory is what the
+call adds to a process that holds the volume. NRMSE is the root mean square difference over 2,304 pixels, divided by the
+root mean square of the march; Siddon's volume is constant within voxels, so that its difference is one of model.
 
 {table(header, cells)}
 

@@ -3,9 +3,9 @@
 import multiprocessing
 import os
 import platform
-import resource
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -32,11 +32,10 @@ class Timing:
         return f"{a:.3g} ({b:.3g}–{c:.3g})"
 
 
-def measure(call: Callable[[], object], device: str, seconds: float) -> Timing:
+def measure(call: Callable[[], object], device: str, seconds: float, before_mib: float = 0.0) -> Timing:
     """Time `call` for about `seconds`, three times at least. Its first run, not timed, gives the peak memory."""
-    before = _resident_mib(device)
     call()
-    peak = max(0.0, _peak_mib(device) - before)
+    peak = max(0.0, _peak_mib(device) - before_mib)
     times: list[float] = []
     while len(times) < 3 or (sum(times) < seconds and len(times) < 200):
         start = time.perf_counter()
@@ -48,26 +47,32 @@ def measure(call: Callable[[], object], device: str, seconds: float) -> Timing:
     return Timing(float(median), float(p10), float(p90), peak)
 
 
-def _resident_mib(device: str) -> float:
+def resident_mib(device: str) -> float:
+    """Memory in MiB held now, which `measure` subtracts; the peak is counted anew from here."""
     if device == "cuda":
         torch.cuda.synchronize()
         torch.cuda.reset_peak_memory_stats()
         return torch.cuda.memory_allocated() / 2**20
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+    Path("/proc/self/clear_refs").write_text("5")  # Linux: sets VmHWM back to VmRSS (proc_pid_clear_refs(5))
+    return _status_mib("VmRSS")
 
 
 def _peak_mib(device: str) -> float:
     if device == "cuda":
         torch.cuda.synchronize()
         return torch.cuda.max_memory_allocated() / 2**20
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return _status_mib("VmHWM")
+
+
+def _status_mib(field: str) -> float:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(field)) / 1024
 
 
 def in_own_process(function: Callable[..., Any], *arguments: object) -> Any:
     """`function(*arguments)` in a fresh process, so that its peak memory is its own."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(function, arguments)
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
 
 
 def missing(package: str) -> str | None:

@@ -5,6 +5,7 @@ All take the same volume, camera and `camera_from_volume`, and are differentiabl
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from femoreg_torch.geometry import Camera
 from femoreg_torch.volume.grid import Volume
 
 Render = Callable[[Tensor], Tensor]
+Build = Callable[[Volume, Camera, str], tuple[str, Render]]
 
 
 def unit_rays(camera: Camera) -> Tensor:
@@ -96,10 +98,10 @@ def diffdrr(volume: Volume, camera: Camera, device: str, step_mm: float | None) 
     return f"DiffDRR, {f'trilinear, {step_mm:g} mm steps' if step_mm else 'siddon'}", image
 
 
-RENDERERS = {
-    "femoreg": (None, lambda *scene: femoreg(*scene, 1.0)),
-    "nanodrr": ("nanodrr", lambda *scene: nanodrr(*scene, 1.0)),
-    "nanodrr-default": ("nanodrr", lambda *scene: nanodrr(*scene, None)),
-    "diffdrr-trilinear": ("diffdrr", lambda *scene: diffdrr(*scene, 1.0)),
-    "diffdrr-siddon": ("diffdrr", lambda *scene: diffdrr(*scene, None)),
+RENDERERS: dict[str, tuple[str | None, Build]] = {  # the package that must be there, and how to set the renderer up
+    "femoreg": (None, partial(femoreg, step_mm=1.0)),
+    "nanodrr": ("nanodrr", partial(nanodrr, step_mm=1.0)),
+    "nanodrr-default": ("nanodrr", partial(nanodrr, step_mm=None)),
+    "diffdrr-trilinear": ("diffdrr", partial(diffdrr, step_mm=1.0)),
+    "diffdrr-siddon": ("diffdrr", partial(diffdrr, step_mm=None)),
 }

@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict
 from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -38,9 +39,12 @@ def load_weights(path: Path | None = None) -> UNet:
     if "config" not in metadata:
         raise ValueError(f"{path}: its metadata has no `config`, so these are no weights of this network.")
     try:
-        shape = {key: tuple(v) if isinstance(v, list) else v for key, v in json.loads(metadata["config"]).items()}
-        network = UNet(UNetConfig(**shape))
+        network = UNet(_config(json.loads(metadata["config"])))
         network.load_state_dict(state)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: weights and `config` do not fit this network ({error}).") from error
     return network.eval()
+
+
+def _config(values: dict[str, Any]) -> UNetConfig:
+    return UNetConfig(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})

@@ -183,5 +183,7 @@ def _inside(mesh: trimesh.Trimesh, camera_from_device: Tensor, carm: CArm, margi
     """Whether the whole mesh falls on the detector, at least `margin_mm` from its edges, in all views."""
     vertices = torch.tensor(mesh.vertices, dtype=torch.float64)
     pixels = project_points(carm.camera, transform_points(camera_from_device, vertices))
-    last = torch.tensor(carm.camera.shape[::-1], dtype=torch.float64) - 1 - margin_px
-    return bool(((pixels >= margin_px) & (pixels <= last)).all())
+    rows, columns = carm.camera.shape
+    margin = margin_mm / torch.tensor(carm.camera.pixel_mm[::-1], dtype=torch.float64)
+    last = torch.tensor([columns - 1, rows - 1], dtype=torch.float64)
+    return bool(((pixels >= margin) & (pixels <= last - margin)).all())

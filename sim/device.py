@@ -39,7 +39,7 @@ def make_device(seed: int) -> tuple[trimesh.Trimesh, dict[str, Tensor]]:
         seed: not negative; draws the dimensions, within about 110 mm along the guide.
 
     Returns:
-        The surface, and `tip` (centre of the guide's tip), `base` (on the axis at its other end) and `center` (middle of
+        The surface, and `tip` (centre of the guide's tip), `base` (on the axis, other end) and `center` (middle of
         the guide), each (3,) float64 mm.
     """
     if seed < 0:

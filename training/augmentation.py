@@ -56,6 +56,10 @@ def _uniform(low: float, high: float, shape: tuple[int, ...], generator: Generat
     return low + (high - low) * torch.rand(shape, generator=generator)
 
 
+def _log_uniform(low: float, high: float, shape: tuple[int, ...], generator: Generator) -> Tensor:
+    return torch.exp(_uniform(math.log(low), math.log(high), shape, generator))
+
+
 def _chosen(share: float, count: int, generator: Generator) -> Tensor:
     return torch.rand((count, 1, 1), generator=generator) < share
 
@@ -126,8 +130,8 @@ def add_instruments(attenuation: Tensor, settings: AugmentationSettings, generat
         from_start = torch.stack([column, row]) - start
         share = ((from_start * along).sum(1) / (along**2).sum(1)).clamp(0, 1)[:, None]
         distance = ((from_start - share * along) ** 2).sum(1).sqrt()
-        radius = torch.exp(_uniform(math.log(0.8), math.log(12.0), (count, 1, 1), generator))
-        depth = torch.exp(_uniform(math.log(0.2), math.log(4.0), (count, 1, 1), generator))
+        radius = _log_uniform(0.8, 12.0, (count, 1, 1), generator)
+        depth = _log_uniform(0.2, 4.0, (count, 1, 1), generator)
         # chord of a round rod, with half a pixel of blur at its rim
         chord = ((radius + 0.5 - distance).clamp_min(0) / (radius + 0.5)).sqrt()
         attenuation = attenuation + there * depth * chord
@@ -142,8 +146,7 @@ def expose(attenuation: Tensor, settings: AugmentationSettings, generator: Gener
     coarse = F.avg_pool2d(primary[:, None], 8)
     spread = F.interpolate(gaussian_blur2d(coarse, (7, 7), (3.0, 3.0)), primary.shape[1:], mode="bilinear")[:, 0]
     beam = primary + _uniform(*settings.scatter, (count, 1, 1), generator) * spread
-    low, high = (math.log(v) for v in settings.photons)
-    photons = torch.exp(_uniform(low, high, (count, 1, 1), generator))
+    photons = _log_uniform(*settings.photons, (count, 1, 1), generator)
     signal = torch.poisson(beam * photons, generator=generator)[:, None]
     sigma = _uniform(*settings.blur_px, (count, 1), generator).expand(count, 2)
     signal = gaussian_blur2d(signal, (7, 7), sigma)[:, 0] / photons
@@ -156,7 +159,7 @@ def alter_contrast(images: Tensor, settings: AugmentationSettings, generator: Ge
     """Gamma of the grey values between each image's extremes, and rarely an inversion."""
     count = len(images)
     low, high = images.amin((1, 2), keepdim=True), images.amax((1, 2), keepdim=True)
-    gamma = torch.exp(_uniform(*(math.log(v) for v in settings.gamma), (count, 1, 1), generator))
+    gamma = _log_uniform(*settings.gamma, (count, 1, 1), generator)
     grey = ((images - low) / (high - low).clamp_min(1e-6)) ** gamma
     return torch.where(_chosen(settings.inverted_share, count, generator), 1 - grey, grey)
 

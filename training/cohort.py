@@ -4,6 +4,7 @@ import json
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from femoreg_torch.geometry import load_carm
 from femoreg_torch.volume import read_ct, read_labels, read_landmarks
 from sim.dataset import write_views
 from sim.layers import Layers, deform, smooth_displacement, split_layers
+from sim.patient import make_patient
 from sim.views import ViewRanges
 
 
@@ -46,13 +48,14 @@ def render_cohort(
     training: list[Path] = []
     for case in cases:
         name = case.resolve().name
-        training += _variants(settings, cache, name, settings.case_variants, lambda case=case: _read_case(case), report)
+        training += _variants(settings, cache, name, settings.case_variants, partial(_read_case, case), report)
     for seed in settings.patient_seeds:
-        source = _patient(seed, settings)
-        training += _variants(settings, cache, f"patient{seed}", settings.patient_variants, source, report)
+        make = partial(_make_patient, seed, settings.patient_spacing_mm)
+        training += _variants(settings, cache, f"patient{seed}", settings.patient_variants, make, report)
     validation: list[Path] = []
     for seed in settings.validation_seeds:
-        validation += _variants(settings, cache, f"patient{seed}", 1, _patient(seed, settings), report)
+        make = partial(_make_patient, seed, settings.patient_spacing_mm)
+        validation += _variants(settings, cache, f"patient{seed}", 1, make, report)
     return training, validation
 
 
@@ -62,14 +65,9 @@ def _read_case(folder: Path) -> Layers:
     return split_layers(ct, labels, read_landmarks(folder / "landmarks.json"))
 
 
-def _patient(seed: int, settings: CohortSettings) -> Callable[[], Layers]:
-    def make() -> Layers:
-        from sim.patient import make_patient
-
-        patient = make_patient(seed, settings.patient_spacing_mm)
-        return split_layers(patient.ct, patient.labels, patient.landmarks)
-
-    return make
+def _make_patient(seed: int, spacing_mm: float) -> Layers:
+    patient = make_patient(seed, spacing_mm)
+    return split_layers(patient.ct, patient.labels, patient.landmarks)
 
 
 def _variants(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import torch
 from lightning import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from models.losses import landmark_log_probabilities, multi_task_loss
@@ -56,12 +57,12 @@ class HipTraining(LightningModule):
         )
         return prediction, losses
 
-    def training_step(self, batch: Batch, _: int) -> Tensor:
+    def training_step(self, batch: Batch, _number: int) -> Tensor:
         _, losses = self._losses(batch)
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, batch_size=len(batch.images))
         return losses["loss"]
 
-    def validation_step(self, batch: Batch, _: int) -> None:
+    def validation_step(self, batch: Batch, _number: int) -> None:
         prediction, losses = self._losses(batch)
         absent = landmark_log_probabilities(prediction.heatmaps, prediction.absence)[..., -1].exp()
         correct = ((absent < 0.5) == batch.visible).float().mean()
@@ -76,7 +77,7 @@ class HipTraining(LightningModule):
         }
         self.log_dict(values, batch_size=len(batch.images), prog_bar=True)
 
-    def configure_optimizers(self) -> dict[str, object]:
+    def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         s = self.settings
         optimiser = torch.optim.AdamW(self.parameters(), s.learning_rate, weight_decay=s.weight_decay)
         schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, self._rate)

@@ -34,12 +34,11 @@ def draw_overlay(attenuation: Tensor, detection: Detection, camera: Camera) -> N
             colour = _SIDE_COLOURS[name[-1]]
             cv2.circle(picture, (column, row), 4, colour, 1, cv2.LINE_AA)
             cv2.putText(picture, name, (column + 6, row - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
-    return picture
+    return np.asarray(picture, dtype=np.uint8)
 
 
 def _labels_on_picture(detection: Detection, camera: Camera, zoom: float, size: tuple[int, int]) -> NDArray[np.uint8]:
     """The most probable label of each pixel of the picture, 0 outside of the network's grid."""
-    labels = detection.segmentation.argmax(0).to(torch.uint8).numpy()
     grid = detection.network_camera
     # Both images lie on one detector: mm from the principal point, column and row, agree.
     affine = np.zeros((2, 3))
@@ -48,4 +47,6 @@ def _labels_on_picture(detection: Detection, camera: Camera, zoom: float, size: 
         affine[axis, axis] = ratio / zoom
         start = 0.5 / zoom - 0.5 - camera.principal_point_px[axis]
         affine[axis, 2] = grid.principal_point_px[axis] + ratio * start
-    return cv2.warpAffine(labels, affine, size, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    probabilities = [cv2.warpAffine(p, affine, size, flags=flags) for p in detection.segmentation.float().numpy()]
+    return np.argmax(probabilities, 0).astype(np.uint8)

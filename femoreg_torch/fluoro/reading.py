@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pydicom
-import SimpleITK as sitk  # noqa: N813 (its own documentation's name)
+import SimpleITK as sitk
 import torch
 from pydicom.errors import InvalidDicomError
 from pydicom.pixels import apply_rescale

@@ -74,7 +74,7 @@ def _step(content: dict[str, Any], where: str) -> Stage | OrbitSearch:
     parser = ArgumentParser(exit_on_error=False)
     parser.add_class_arguments(kind)
     try:
-        step = kind(**vars(parser.instantiate_classes(parser.parse_object(content))))
+        step = kind(**vars(parser.instantiate(parser.parse_object(content))))
     except (ArgumentError, TypeError) as error:
         raise InputError(f"{where}: {' '.join(str(error).split())}") from error
     for body in getattr(step, "bodies", []):

@@ -31,15 +31,15 @@ class Axes:
         return x, y, z
 
 
-def smooth_noise(rng: np.random.Generator, axes: Axes, sigma_mm: float) -> Array:
-    """Gaussian random field (X, Y, Z), mean 0, deviation 1, drawn on its own grid: the voxel size does not alter it."""
+def smooth_noise(rng: np.random.Generator, lo: Points, hi: Points, sigma_mm: float) -> Field:
+    """Gaussian random field of mean 0 and deviation 1 from `lo` to `hi` (3,) mm.
+
+    It has a grid of its own, so that the voxel size of the scan does not alter it.
+    """
     step = max(1.0, sigma_mm / 2)
-    lo = np.floor(np.array([axes.x[0], axes.y[0], axes.z[0]])) - step
-    hi = np.ceil(np.array([axes.x[-1], axes.y[-1], axes.z[-1]])) + step
     shape = np.ceil((hi - lo) / step).astype(int) + 2
     noise = ndimage.gaussian_filter(rng.standard_normal(shape, dtype=np.float32), sigma_mm / step)
-    noise = (noise - noise.mean()) / noise.std()
-    return Field(noise, lo, step).on_axes(axes.x, axes.y, axes.z)
+    return Field((noise - noise.mean()) / noise.std(), lo, step)
 
 
 def _ramp(x: Array, x0: float, x1: float, y0: float, y1: float) -> Array:
@@ -96,7 +96,8 @@ def bone_hu(
     150, fatty marrow -30; the cortex thickness runs from 1.25 mm (iliac wing) to 4.4 mm (shaft).
     """
     depth = -field.on_axes(axes.x, axes.y, axes.z)
-    grain, patches = smooth_noise(rng, axes, 0.8), smooth_noise(rng, axes, 5.0)
+    end = field.lo + field.step * (np.array(field.values.shape) - 1)
+    grain, patches = (smooth_noise(rng, field.lo, end, s).on_axes(axes.x, axes.y, axes.z) for s in (0.8, 5.0))
     thick, spongy, cortex = _materials(name, axes, skeleton, 55 * grain + 45 * patches, grain)
     filled = np.clip(depth / spacing_mm + 0.5, 0, 1)
     core = np.clip((depth - thick * parameters.cortex) / spacing_mm + 0.5, 0, 1)

@@ -4,7 +4,7 @@ Standard pelvis: mm, x to the patient's left, y back, z up, in the anterior pelv
 the femoral heads, whose centres lie at x = ±90 and whose radius is 24. All shapes below are the left bone.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from sim.patient.sdf import Field, ball, ball_union, sheet, tube
 
 Points = NDArray[np.float64]
 Warp = Callable[[Points], Points]
+Tube = Sequence[Sequence[float]]  # control balls x, y, z, radius
+Sheet = Sequence[Tube]
 
 HEAD = np.array([90.0, 0.0, 0.0])
 HEAD_RADIUS = 24.0
@@ -23,7 +25,7 @@ FIELD_STEP = 1.25
 ROUNDING = 1.2
 
 # x, y, z, radius; rows from the socket's roof up to the crest, columns from front to back
-_WING = [
+_WING: Sheet = [
     [[98, -25, 31, 8], [95, -13, 34, 10.5], [90, 2, 35, 12.5], [84, 13, 36, 12], [78, 23, 37, 9], [75, 30, 38, 5.5]],
     [[108, -33, 46, 6], [103, -19, 48, 8], [96, -4, 50, 10.5], [87, 10, 50, 11.5], [78, 22, 50, 9], [72, 34, 49, 5]],
     [[121, -46, 67, 5.5], [114, -29, 67, 5], [104, -10, 68, 5], [91, 8, 68, 6.5], [72, 36, 66, 10], [63, 70, 60, 4.5]],
@@ -39,28 +41,28 @@ _WING = [
     ],
 ]
 # joint face towards the sacrum, flat and sagittal: rows from top to bottom, columns from front to back
-_AURICULAR = [
+_AURICULAR: Sheet = [
     [[67, 43, 97, 4.5], [66, 55, 98, 6.5], [63, 70, 98, 6]],
     [[65, 38, 80, 4.5], [64, 52, 82, 6.5], [60, 70, 82, 6]],
     [[67, 36, 66, 5], [64, 50, 66, 6], [59, 64, 65, 5]],
 ]
 # the flat inner wall behind the socket: rows from top to bottom, columns from front to back
-_INNER_WALL = [
+_INNER_WALL: Sheet = [
     [[74, -15, 24, 6], [69, -3, 27, 5], [69, 10, 29, 6], [71, 22, 31, 8], [73, 31, 33, 6]],
     [[65, -20, 9, 6], [60, -8, 10, 3], [60, 8, 10, 3], [62, 24, 10, 7], [65, 36, 10, 6]],
     [[63, -19, -3, 5], [59, -9, -3, 2.8], [59, 8, -5, 3.4], [62, 24, -6, 8], [65, 40, -6, 6]],
 ]
 # the brim of the lesser pelvis, from the sacral joint to the pubis
-_BRIM = [[66, 38, 68, 5], [69, 28, 54, 5.5], [69, 18, 42, 5.2], [65, 6, 31, 5], [61, -8, 22, 5], [56, -18, 13, 5]]
-_ISCHIUM = [
+_BRIM: Tube = [[66, 38, 68, 5], [69, 28, 54, 5.5], [69, 18, 42, 5.2], [65, 6, 31, 5], [61, -8, 22, 5], [56, -18, 13, 5]]
+_ISCHIUM: Sheet = [
     [[69, 12, -8, 6], [73, 25, -8, 10], [69, 39, -7, 6.5]],
     [[68, 15, -20, 7], [73, 29, -21, 11], [69, 42, -20, 7]],
     [[66, 20, -33, 7.5], [72, 33, -34, 10.5], [69, 46, -33, 8]],
     [[64, 24, -44, 7.5], [69, 35, -46, 10], [66, 45, -45, 8]],
     [[57, 25, -54, 5.5], [60, 32, -57, 7], [61, 38, -56, 7]],
 ]
-_SPINE = [[64, 36, 4, 6], [60, 45, 0, 4.8], [54.5, 53, -3, 2.4]]
-_UPPER_RAMUS = [
+_SPINE: Tube = [[64, 36, 4, 6], [60, 45, 0, 4.8], [54.5, 53, -3, 2.4]]
+_UPPER_RAMUS: Tube = [
     [82, -16, 22, 9],
     [71, -19, 15, 9.8],
     [60, -22, 7, 10],
@@ -69,25 +71,25 @@ _UPPER_RAMUS = [
     [28, -33.5, -13.5, 8],
     [15, -35, -19.5, 8.6],
 ]
-_PECTEN = [[60, -16, 14, 4], [50, -20, 8, 4], [39, -25, 1, 3.6], [28, -31, -6, 3.8], [19, -37, -11.5, 4.6]]
+_PECTEN: Tube = [[60, -16, 14, 4], [50, -20, 8, 4], [39, -25, 1, 3.6], [28, -31, -6, 3.8], [19, -37, -11.5, 4.6]]
 # under the socket the ramus is a blade that rounds off the upper corner of the foramen
-_OBTURATOR_CREST = [
+_OBTURATOR_CREST: Sheet = [
     [[70, -10, 4, 4], [61, -17, 0, 5], [50, -24, -4, 6]],
     [[68, 2, -8, 4.5], [61, -8, -7, 3.6], [49, -20, -10, 4.5]],
 ]
-_PUBIC_BODY = [
+_PUBIC_BODY: Sheet = [
     [[8, -37, -20, 8], [15, -35, -20.5, 8.6], [26, -31, -19, 8]],
     [[8, -31, -28, 7.5], [14, -28, -28, 7.5], [26, -24, -25, 6.8]],
     [[7, -23, -35, 5.6], [14, -18, -36, 5.8], [20, -16, -34, 4.8]],
 ]
-_LOWER_RAMUS = [
+_LOWER_RAMUS: Sheet = [
     [[11, -21, -39, 4.4], [17, -17, -32, 4.2]],
     [[21, -10, -47, 4.4], [28, -8, -38, 4.4]],
     [[33, 2, -54, 4.4], [39, 3, -45, 4.6]],
     [[45, 14, -58, 4.8], [50, 13, -48, 5]],
     [[56, 27, -59, 6], [60, 24, -45, 6]],
 ]
-_SPINES = [
+_SPINES: list[Tube] = [
     [[121, -46, 68, 5.5], [124, -48, 75, 5.8], [129, -43, 85, 6]],  # anterior superior
     [[98, -25, 28, 7.5], [102, -31, 35, 7], [107, -32, 42, 6.5]],  # anterior inferior
     [[60, 86, 80, 5.5], [53, 94, 82, 4.6]],  # posterior superior

@@ -58,7 +58,7 @@ def draw_parameters(rng: np.random.Generator) -> PatientParameters:
     population", Clin. Orthop. 467, 2009; Milner and Boldsen, J. Forensic Sci. 57, 2012); distance of the hip centres
     and of the ASIS, wider pelvic ring for its height in women (Seidel et al., "Hip joint center location from palpable
     bony landmarks", J. Biomech. 28, 1995; Bell et al., J. Biomech. 23, 1990). Supine tilt of the anterior pelvic
-    plane 4 ± 6° (Lembeck et al., Clin. Orthop. 2005). The pose of the legs and the habitus are our own ranges.
+    plane 4 ± 6° (Lembeck et al., Acta Orthop. 76, 2005). The pose of the legs and the habitus are our own ranges.
     """
     female = bool(rng.random() < 0.6)
     size = _within(rng, 0.965 if female else 1.03, 0.035, 0.88, 1.12)

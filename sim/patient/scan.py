@@ -101,8 +101,8 @@ def make_patient(seed: int, spacing_mm: float = 1.0) -> Patient:
         spacing_mm: voxel size, 0.5 to 2 mm.
 
     Returns:
-        CT in HU and labels (1 left hip bone, 2 right, 3 vertebrae, 4 sacrum, 5 left femur, 6 right femur) on one grid
-        along the LPS axes, whose origin lies midway between the femoral heads; landmarks in LPS mm; the parameters drawn.
+        CT in HU and labels (1 left hip, 2 right, 3 vertebrae, 4 sacrum, 5 left femur, 6 right) on one grid
+        along the LPS axes, whose origin lies midway between the femoral heads; landmarks in LPS mm; parameters.
     """
     if seed < 0:
         raise InputError(f"patient: seed is {seed}, expected 0 or more.")

@@ -55,7 +55,7 @@ class Field:
         return values
 
     def on_axes(self, x: Points, y: Points, z: Points) -> Array:
-        """Trilinear values (X, Y, Z) on the grid spanned by three rising lists of mm; beyond this field those of its edge."""
+        """Trilinear values (X, Y, Z) on the grid of three rising lists of mm; beyond this field those of its edge."""
         values = self.values
         for axis, position in enumerate((x, y, z)):
             index = np.clip((position - self.lo[axis]) / self.step, 0, values.shape[axis] - 1)

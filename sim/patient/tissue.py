@@ -37,6 +37,12 @@ class SoftTissue:
         return hu, depth
 
 
+def _noise(rng: np.random.Generator, axes: Axes, sigma_mm: float) -> Array:
+    """Gaussian random field (X, Y, Z) on the coarse grid."""
+    lo, hi = (np.array([axis[k] for axis in (axes.x, axes.y, axes.z)]) for k in (0, -1))
+    return smooth_noise(rng, lo, hi, sigma_mm).on_axes(axes.x, axes.y, axes.z)
+
+
 def _super_ellipse(u: Array, v: Array, power: float) -> Array:
     return (np.abs(u) ** power + np.abs(v) ** power).astype(np.float32)
 
@@ -70,7 +76,7 @@ def _viscera(axes: Axes, skeleton: Skeleton, rng: np.random.Generator) -> tuple[
     half = abs(float(skeleton.heads["left"][0]))
     belly = (x / (1.05 * half)) ** 2 + ((y + 5) / 58) ** 2 + (np.clip(140 - z, 0, None) / 85) ** 2 < 1
     cavity = (x / (0.62 * half)) ** 2 + ((y - 22) / 55) ** 2 + ((z - 45) / 66) ** 2 < 1
-    loops = smooth_noise(rng, axes, 9)
+    loops = _noise(rng, axes, 9)
     gas_from = rng.uniform(1.1, 2.0)  # some bowels hold much gas, some hardly any
     hu = np.where(loops > 0.1, 38, -100).astype(np.float32)
     hu = np.where(loops > gas_from, -820, hu)
@@ -81,7 +87,7 @@ def _viscera(axes: Axes, skeleton: Skeleton, rng: np.random.Generator) -> tuple[
     rectum = ((x - 6 * np.sin(z / 25)) / 17) ** 2 + ((y - 52 - 8 * np.sin(z / 40)) / 15) ** 2
     near = np.abs(z - 40) < 45
     hu = np.where((rectum < 1) & near, 30, hu)
-    hu = np.where((rectum < 0.3) & near & (smooth_noise(rng, axes, 8) > 0.2), -800, hu)
+    hu = np.where((rectum < 0.3) & near & (_noise(rng, axes, 8) > 0.2), -800, hu)
     return belly | cavity, hu.astype(np.float32)
 
 
@@ -111,14 +117,14 @@ def make_soft_tissue(
     fat = parameters.habitus * (
         11 + 7 * np.clip(y / 80, 0, 1) + 5 * np.clip((z - 40) / 100, 0, 1) * np.clip(-y / 60, 0, 1)
     )
-    fat = np.maximum(fat + 2.5 * smooth_noise(rng, axes, 25), 4).astype(np.float32)
-    inner = 52 + 6 * smooth_noise(rng, axes, 4) + 4 * smooth_noise(rng, axes, 12)
-    inner[np.abs(smooth_noise(rng, axes, 9)) < 0.06 + 0.05 * parameters.habitus] = -75  # fat planes between the muscles
+    fat = np.maximum(fat + 2.5 * _noise(rng, axes, 25), 4).astype(np.float32)
+    inner = 52 + 6 * _noise(rng, axes, 4) + 4 * _noise(rng, axes, 12)
+    inner[np.abs(_noise(rng, axes, 9)) < 0.06 + 0.05 * parameters.habitus] = -75  # fat planes between the muscles
     cavity, viscera = _viscera(axes, skeleton, rng)
     cavity &= (within > 14) & (bone > 6)
     inner[cavity] = viscera[cavity]
     inner[(second < 2.6) & (bone > -1)] = 95  # cartilage, discs
-    fat_hu = (-95 + 6 * smooth_noise(rng, axes, 5)).astype(np.float32)
+    fat_hu = (-95 + 6 * _noise(rng, axes, 5)).astype(np.float32)
     fields = (within + fat, fat, inner.astype(np.float32), fat_hu)
     depth, fat_field, inner_field, fat_hu_field = (Field(values.astype(np.float32), lo, STEP_MM) for values in fields)
     return SoftTissue(depth, fat_field, inner_field, fat_hu_field)

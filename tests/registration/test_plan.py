@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-
 from femoreg_torch.configs import preset_names
+
 from femoreg_torch.errors import InputError
 from femoreg_torch.optimize import Bobyqa, CmaEs
 from femoreg_torch.registration import load_plan

@@ -1,7 +1,7 @@
 """Trust: given at the truth, withheld where a pose is wrong or an object cannot be seen."""
 
 import pytest
-from registration.scenes import REFERENCE_POINTS, float64, make_scene, off, true_poses
+from registration_scenes import REFERENCE_POINTS, float64, make_scene, off, true_poses
 
 from femoreg_torch.registration import Scene, quality
 from femoreg_torch.registration.objective import Level

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import SimpleITK as sitk  # noqa: N813 (its own documentation's name)
+import SimpleITK as sitk
 import torch
 from scipy.spatial.transform import Rotation
 

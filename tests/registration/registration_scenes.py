@@ -1,4 +1,4 @@
-"""A small operating room: three rigid objects, three views, images made by another projector than the one that registers."""
+"""A small operating room: three rigid objects, three views, images rendered more finely than they are registered."""
 
 import math
 
@@ -6,13 +6,13 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from femoreg_torch.drr.reference import march
-from femoreg_torch.geometry import CArm, about_point, centred_camera, exp_se3, invert_rigid, rigid, rotation_angle
+from femoreg_torch.drr import project
+from femoreg_torch.geometry import CArm, about_point, centred_camera, exp_se3, rigid, rotation_angle
 from femoreg_torch.registration import Poses, Scene
 from femoreg_torch.registration.scene import Kind
 from femoreg_torch.volume import Volume, axis_aligned
 
-CARM = CArm(centred_camera(1020.0, (4.0, 4.0), (64, 64)), (0.0, 0.0, 632.0), (0.0, 1.0, 0.0))
+CARM = CArm(centred_camera(1020.0, (3.0, 3.0), (88, 88)), (0.0, 0.0, 632.0), (0.0, 1.0, 0.0))
 VOXEL_MM = 3.0
 VIEW_ANGLES_DEG = (0.0, 10.0, -15.0)
 
@@ -21,31 +21,41 @@ def float64(*values: float) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def bone(seed: int, voxels: tuple[int, int, int], mu: float) -> Volume:
-    """A lumpy object without any symmetry, in the middle of its own space."""
+def bone(seed: int, voxels: tuple[int, int, int], mu: float, middle: tuple[float, ...] = (0, 0, 0)) -> Volume:
+    """A lumpy hollow object without any symmetry, with its middle at a given place of its own space."""
     generator = torch.Generator().manual_seed(seed)
     noise = torch.from_numpy(ndimage.gaussian_filter(torch.rand(*voxels, generator=generator).numpy(), 2.0))
     edge = torch.zeros(voxels)
     edge[3:-3, 3:-3, 3:-3] = 1
-    filled = (noise > noise.quantile(0.6)) * edge
-    soft = torch.from_numpy(ndimage.gaussian_filter(filled.float().numpy(), 0.7)) * mu
-    origin = [-(n - 1) / 2 * VOXEL_MM for n in voxels[::-1]]
+    filled = (noise > noise.quantile(0.65)) & edge.bool()
+    shell = filled.numpy() & ~ndimage.binary_erosion(filled.numpy())
+    soft = torch.from_numpy(ndimage.gaussian_filter(shell.astype("float32"), 0.5)) * mu
+    origin = [m - (n - 1) / 2 * VOXEL_MM for m, n in zip(middle, voxels[::-1], strict=True)]
     return Volume(soft, axis_aligned((VOXEL_MM,) * 3, (origin[0], origin[1], origin[2])))
 
 
-VOLUMES = {"pelvis": bone(1, (36, 28, 44), 0.02), "femur": bone(2, (30, 16, 14), 0.02), "device": bone(3, (10, 10, 26), 0.1)}
-REFERENCE_POINTS = {"pelvis": float64(0, 0, 0), "femur": float64(0, 0, 30), "device": float64(0, 0, 0)}
+VOLUMES = {
+    "pelvis": bone(1, (44, 34, 52), 0.06),
+    "femur": bone(2, (36, 20, 18), 0.06, (70, 0, 20)),  # in the same space: one CT holds both
+    "device": bone(3, (12, 12, 30), 0.2),
+}
+REFERENCE_POINTS = {"pelvis": float64(0, 0, 0), "femur": float64(64, 0, -20), "device": float64(0, 0, 0)}
 
 
 def true_poses() -> Poses:
-    """Pelvis and femur 740 mm from the source, the device in front of them; views along the orbit and a little off it."""
-    off_orbit = [rigid(), exp_se3(float64(0.01, -0.012, 0.01, 2, -1.5, 3)), exp_se3(float64(-0.01, 0.01, -0.015, -1, 2, -3))]
+    """Pelvis and femur 740 mm from the source, the device in front of them; views a little off the orbit."""
+    off_orbit = [
+        rigid(),
+        exp_se3(float64(0.004, -0.005, 0.004, 1, -0.8, 3)),
+        exp_se3(float64(-0.004, 0.004, -0.006, -0.5, 1, -3)),
+    ]
     orbit = CARM.orbit(float64(*VIEW_ANGLES_DEG) * math.pi / 180)
+    pelvis = exp_se3(float64(0.1, -0.2, 0.05, 0, 0, 0)) + _shift(-24, -8, 740)
     return Poses(
         torch.stack([extra @ turn for extra, turn in zip(off_orbit, orbit, strict=True)]),
         {
-            "pelvis": exp_se3(float64(0.1, -0.2, 0.05, 0, 0, 0)) + _shift(-12, -8, 740),
-            "femur": exp_se3(float64(-0.1, 0.15, 0.2, 0, 0, 0)) + _shift(58, 20, 745),
+            "pelvis": pelvis,
+            "femur": off(pelvis, REFERENCE_POINTS["femur"], (6, -5, 8), (0, 0, 0)),
             "device": exp_se3(float64(0.2, 0.9, 0.3, 0, 0, 0)) + _shift(10, 12, 560),
         },
     )
@@ -58,14 +68,11 @@ def _shift(x: float, y: float, z: float) -> Tensor:
 
 
 def line_integrals(poses: Poses, view: int, names: tuple[str, ...]) -> Tensor:
-    """Line integrals (H, W) by the float64 reference, on a grid twice as fine and averaged, with a step of 0.7 mm."""
-    fine = centred_camera(1020.0, (2.0, 2.0), (128, 128))
-    total = torch.zeros(fine.shape, dtype=torch.float64)
-    for name in names:
-        index_from_camera = invert_rigid(poses.camera_from(name)[view])
-        scale = torch.linalg.inv(VOLUMES[name].lps_from_index)
-        total += march(VOLUMES[name].data.double(), (scale @ index_from_camera)[None], fine, 0.7)[0]
-    return torch.nn.functional.avg_pool2d(total[None, None], 2)[0, 0]
+    """Line integrals (H, W) on a grid four times as fine and averaged, with a step of 0.3 mm."""
+    fine = centred_camera(1020.0, (0.75, 0.75), (352, 352))
+    where = torch.stack([poses.camera_from(name)[view] for name in names])[None]
+    total = project([VOLUMES[name] for name in names], where, fine, 0.3)[0]
+    return torch.nn.functional.avg_pool2d(total[None, None], 4)[0, 0]
 
 
 def make_scene(poses: Poses, seed: int = 0, with_device: bool = True) -> Scene:
@@ -74,7 +81,7 @@ def make_scene(poses: Poses, seed: int = 0, with_device: bool = True) -> Scene:
 
     def image(view: int, names: tuple[str, ...]) -> Tensor:
         exact = line_integrals(poses, view, names)
-        return (exact + 0.01 * torch.randn(exact.shape, generator=generator, dtype=torch.float64)).float()
+        return exact + 0.003 * torch.randn(exact.shape, generator=generator)
 
     views = range(len(poses.camera_from_camera1))
     images: dict[Kind, tuple[Tensor, ...]] = {"anatomy": tuple(image(v, ("pelvis", "femur")) for v in views)}
