@@ -47,4 +47,5 @@ def load_weights(path: Path | None = None) -> UNet:
 
 
 def _config(values: dict[str, Any]) -> UNetConfig:
-    return UNetConfig(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
+    fields: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in values.items()}
+    return UNetConfig(**fields)

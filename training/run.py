@@ -16,6 +16,7 @@ from femoreg_torch.files import temporary_file, write_json
 from models.unet import UNet
 from models.weights import SHIPPED_WEIGHTS, load_weights, save_weights
 from training.cohort import render_cohort
+from training.curves import draw_curves
 from training.data import ViewData
 from training.module import HipTraining
 from training.settings import TrainingSettings
@@ -76,10 +77,11 @@ def train_network(
         logger=[CSVLogger(out, "csv", version=""), TensorBoardLogger(out, "tensorboard", version="")],
         callbacks=[best, EMAWeightAveraging(decay=optimisation.averaging), RichProgressBar(refresh_rate=25)],
         enable_model_summary=False,
-        log_every_n_steps=25,
+        log_every_n_steps=min(25, optimisation.batches_per_epoch),
         limit_val_batches=1.0 if validation else 0,
     )
     trainer.fit(module, data, ckpt_path=last if resume else None)
+    draw_curves(out / "csv" / "metrics.csv", out / "curves.png")
     return export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
 
 

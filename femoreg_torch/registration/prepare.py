@@ -64,4 +64,3 @@ def _attenuation(case: Case, index: int, view: View, kind: Kind) -> Tensor:
     image = read_image(path)
     check_matches(image, case.carm.camera, f"{case.folder}/case.yaml, views[{index}].{kind}")
     return attenuation_image(image) if view.intensity == "raw" else image
-

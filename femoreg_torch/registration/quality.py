@@ -1,8 +1,8 @@
 """Can a registration be trusted? Asked of every object in every view, without knowing the truth.
 
-Two signs of a wrong pose are measured at the solution. First, what the image gains when the object is drawn: a bone or a
-device that is not where it is drawn explains little of the image. Second, where each view by itself would move the object
-in its own image plane: views that pull in different directions contradict each other, or their common geometry.
+Two signs of a wrong pose are measured at the solution. First, what the image gains when the object is drawn: a bone or
+a device that is not where it is drawn explains little of the image. Second, where each view by itself would move the
+object in its own image plane: views that pull in different directions contradict each other, or their common geometry.
 """
 
 from collections.abc import Sequence

@@ -17,7 +17,8 @@ from femoreg_torch.registration.workflow import Report, run_plan
 def register_case(case: Case, preset: str, seed: int, weights: Path | None, report: Report) -> dict[str, Any]:
     """Register a case; returns the content of its `result.json` but for the errors against a truth.
 
-    `weights` are those of the landmark network, None for those shipped. Raises `InputError` for input that does not fit.
+    `weights` are those of the landmark network, None for those shipped. Raises `InputError` for input that does not
+    fit.
     """
     plan = load_plan(preset)
     clock = {"began": time.perf_counter()}

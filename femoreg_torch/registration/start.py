@@ -14,14 +14,12 @@ from femoreg_torch.volume import HIP_LANDMARKS
 
 
 def start_from_landmarks(case: Case, scene: Scene, network: nn.Module) -> tuple[Tensor, dict[str, Any]]:
-    """`camera1_from_pelvis` (4, 4) from the landmarks detected in view 1, and what is worth keeping of how it came about.
+    """`camera1_from_pelvis` (4, 4) from the landmarks detected in view 1, and what is worth keeping of how it came.
 
     Raises `InputError` if fewer than four landmarks are of use.
     """
     detection = detect(network, scene.images["anatomy"][0], scene.carm.camera)
-    usable = [
-        i for i, name in enumerate(HIP_LANDMARKS) if name in case.landmarks and bool(detection.visible[i])
-    ]
+    usable = [i for i, name in enumerate(HIP_LANDMARKS) if name in case.landmarks and bool(detection.visible[i])]
     if len(usable) < 4:
         raise InputError(
             f"{case.views[0].anatomy}: {len(usable)} usable landmarks found, at least 4 are needed. Is this a hip, "

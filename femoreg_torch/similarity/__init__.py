@@ -1,5 +1,7 @@
 """Image similarities: each is prepared with a fixed image and then maps moving images (B, H, W) to costs (B,)."""
 
 from femoreg_torch.similarity.grad_ncc import GradNcc, grad_ncc
+from femoreg_torch.similarity.ncc import Ncc, ncc
+from femoreg_torch.similarity.orientation import GradientOrientation, gradient_orientation
 
-__all__ = ["GradNcc", "grad_ncc"]
+__all__ = ["GradNcc", "GradientOrientation", "Ncc", "grad_ncc", "gradient_orientation", "ncc"]
