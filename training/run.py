@@ -74,14 +74,14 @@ def train_network(
         accelerator="cpu",
         max_epochs=optimisation.epochs,
         reload_dataloaders_every_n_epochs=1,
-        logger=[CSVLogger(out, "csv", version=""), TensorBoardLogger(out, "tensorboard", version="")],
+        logger=[CSVLogger(out, "csv"), TensorBoardLogger(out, "tensorboard", version="")],
         callbacks=[best, EMAWeightAveraging(decay=optimisation.averaging), RichProgressBar(refresh_rate=25)],
         enable_model_summary=False,
         log_every_n_steps=min(25, optimisation.batches_per_epoch),
         limit_val_batches=1.0 if validation else 0,
     )
     trainer.fit(module, data, ckpt_path=last if resume else None)
-    draw_curves(out / "csv" / "metrics.csv", out / "curves.png")
+    draw_curves(out / "tensorboard", out / "curves.png")
     return export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
 
 

@@ -44,9 +44,9 @@ def gradient_orientation(
 ) -> GradientOrientation:
     """Gradient orientation against the fixed image (H, W), as a function of moving images (B, H, W).
 
-    Mean of (2 − ln(|Δθ| + 1)) / 2 over the pixels whose gradient is above the image's median in both images; De Silva et
-    al., 3D–2D image registration for target localization in spine surgery, Phys. Med. Biol. 61 (2016) 3009, eq. 4 and 5.
-    `weights` (H, W) say where to look. Raises `InputError` if the fixed image has no edge there.
+    Mean of (2 − ln(|Δθ| + 1)) / 2 over the pixels whose gradient is above the image's median, nothing where it is not
+    in the moving one; De Silva et al., 3D–2D image registration for target localization in spine surgery, Phys. Med.
+    Biol. 61 (2016) 3009. `weights` (H, W) say where to look. Raises `InputError` if the fixed image has no edge there.
     """
     maps = image_gradients(fixed[None], smoothing_px)[0]
     strength = maps.square().sum(0)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.similarity import grad_ncc, gradient_orientation, ncc
+from femoreg_torch.similarity.kernels import image_gradients
 
 
 def picture(seed: int, height: int = 36, width: int = 30) -> Tensor:
