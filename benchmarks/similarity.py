@@ -97,8 +97,8 @@ def main() -> None:
 
 {size} projections of the {name}, {options.device}, float32.
 Patches of {side} × {side} pixels, Gaussian of {_SMOOTHING_PX} px. `gradient` is value and gradient with respect to the
-candidates' images. The costs differ a little, because nanodrr cuts its Gaussian elsewhere and pads with
-zeros before Sobel.
+candidates' images. The two definitions differ where the Gaussian is cut (nanodrr at 3 σ, here at 2 σ), at the edges of
+the image and in the floor of the variance.
 
 {table(header, cells)}
 

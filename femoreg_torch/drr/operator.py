@@ -1,5 +1,7 @@
 """The one public projector: line integrals through posed volumes, differentiable, on whichever back end fits."""
 
+import functools
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,12 +9,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from femoreg_torch.drr import cpu
+from femoreg_torch.drr import cpu, cuda
 from femoreg_torch.drr.bricks import bricked
 from femoreg_torch.drr.reference import march
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry.camera import Camera
-from femoreg_torch.geometry.rigid import exp_se3
+from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.volume.grid import Volume
 
 
@@ -30,9 +32,12 @@ def project(
     Values are interpolated trilinearly, are zero outside, and are summed at whole multiples of `step_mm` along each ray
     from the source, times the step. Returns (B, H, W) float32, summed over volumes, or (B, V, H, W) if `separate`.
 
-    Differentiable in `camera_from_volume` and in the volumes' data. On the CPU a compiled kernel that skips empty space
-    does the work; on other devices the plain-torch reference does. A sub-window or a coarser grid is a matter of the
-    camera (`Camera.window`, `Camera.downsampled`). Raises `InputError` where the shapes do not fit.
+    Differentiable in `camera_from_volume` and in the volumes' data. Compiled kernels that skip empty space do the work,
+    on the device of the volumes: numba's on the CPU, Triton's on CUDA, where poses should be as well, as a copy from
+    the CPU waits for the device. Where Triton cannot (`cuda.why_not` tells), the slow plain-torch march steps in, with
+    a warning that says why. A sub-window or a coarser grid is a matter of the camera (`Camera.window`,
+    `Camera.downsampled`). Raises `InputError` where shapes or devices do not fit, and for poses that are not finite;
+    these give an image of nan on CUDA, where to look at them would mean to wait.
     """
     _check(volumes, camera_from_volume)
     images = [
@@ -48,22 +53,31 @@ def project_with_jacobian(
     """Images (B, H, W) of one volume and their derivatives (B, H, W, 6) with respect to a twist in the camera frame.
 
     The twist moves the object after its pose: about `centre` (3,) in mm in the camera frame, along the camera's axes,
-    (rotation in rad, translation in mm), taken at zero. CPU only; `camera_from_volume` is (B, 4, 4).
+    (rotation in rad, translation in mm), taken at zero. `camera_from_volume` is (B, 4, 4). On the CPU, or on CUDA with
+    Triton; raises `InputError` where it cannot.
     """
     _check([volume], camera_from_volume[:, None])
+    with torch.no_grad():
+        index_from_camera = _index_from_camera(volume, camera_from_volume)
+        affines = index_from_camera[:, :3]
+        # A small motion of the object changes where a camera point lies in it as the opposite motion of the point would.
+        changes = -affines[:, None] @ _twist_generators(centre.to(index_from_camera))
+    if volume.data.device.type == "cpu":
+        image, jacobian = cpu.jacobian(bricked(volume), affines.numpy(), changes.numpy(), camera, step_mm)
+        return torch.from_numpy(image), torch.from_numpy(jacobian)
+    if reason := cuda.why_not(volume):
+        raise InputError(f"project_with_jacobian: {reason}. Move the volume to the CPU, or use Triton on CUDA.")
+    return cuda.jacobian(volume, affines, changes, camera, step_mm)
 
-    def affines(twist: Tensor) -> Tensor:
-        shift = torch.eye(4, dtype=torch.float64)
-        shift[:3, 3] = centre
-        moved = shift @ exp_se3(twist) @ torch.linalg.inv(shift) @ camera_from_volume.to(torch.float64)
-        return _index_from_camera(volume, moved)[:, :3]
 
-    zero = torch.zeros(6, dtype=torch.float64)
-    changes = torch.autograd.functional.jacobian(affines, zero, vectorize=True)  # (B, 3, 4, 6)
-    image, jacobian = cpu.jacobian(
-        bricked(volume), affines(zero).numpy(), changes.permute(0, 3, 1, 2).numpy(), camera, step_mm
-    )
-    return torch.from_numpy(image), torch.from_numpy(jacobian)
+def _twist_generators(centre: Tensor) -> Tensor:
+    """Derivatives (6, 4, 4) at zero of the motion by a twist about `centre` (3,), for each entry of the twist."""
+    axes = torch.eye(3, dtype=centre.dtype, device=centre.device)
+    generators = centre.new_zeros(6, 4, 4)
+    generators[:3, :3, :3] = skew(axes)
+    generators[:3, :3, 3] = -skew(axes) @ centre
+    generators[3:, :3, 3] = axes
+    return generators
 
 
 def _check(volumes: Sequence[Volume], camera_from_volume: Tensor) -> None:
@@ -72,21 +86,35 @@ def _check(volumes: Sequence[Volume], camera_from_volume: Tensor) -> None:
             f"project: {len(volumes)} volumes need poses of shape (B, {len(volumes)}, 4, 4), "
             f"got {tuple(camera_from_volume.shape)}."
         )
-    if not torch.isfinite(camera_from_volume).all():
+    if len({volume.data.device for volume in volumes}) > 1:
+        raise InputError("project: the volumes lie on different devices. Move them to one.")
+    if camera_from_volume.device.type == "cpu" and not torch.isfinite(camera_from_volume).all():
         raise InputError("project: a pose holds values that are not finite.")
 
 
 def _index_from_camera(volume: Volume, camera_from_volume: Tensor) -> Tensor:
-    """(B, 4, 4) float64 from mm in the camera frame to (x, y, z) indices of the volume."""
-    camera_from_index = camera_from_volume.to(torch.float64) @ volume.lps_from_index.to(camera_from_volume.device)
-    return torch.linalg.inv(camera_from_index)
+    """(B, 4, 4) float64 from mm in the camera frame to (x, y, z) indices, on the device of the volume."""
+    device = volume.data.device
+    lps_from_index = volume.lps_from_index.to(device, non_blocking=True)
+    camera_from_index = camera_from_volume.to(device, torch.float64) @ lps_from_index
+    # To check for singular matrices means to wait for the device, so that only the CPU does.
+    return torch.linalg.inv_ex(camera_from_index, check_errors=device.type == "cpu").inverse
 
 
 def _project_one(volume: Volume, index_from_camera: Tensor, camera: Camera, step_mm: float) -> Tensor:
     if volume.data.device.type == "cpu":
         image: Tensor = _CpuProjection.apply(volume.data, index_from_camera[:, :3], volume, camera, step_mm)
         return image
-    return march(volume.data, index_from_camera.to(torch.float32), camera, step_mm)
+    if reason := cuda.why_not(volume):
+        _warn_of_the_march(reason)
+        return march(volume.data, index_from_camera.to(torch.float32), camera, step_mm)
+    return cuda.project(volume, index_from_camera[:, :3], camera, step_mm)
+
+
+@functools.cache
+def _warn_of_the_march(reason: str) -> None:
+    """Once per reason, not once per image."""
+    warnings.warn(f"project: {reason}. The plain-torch march steps in, which is far slower.", stacklevel=4)
 
 
 class _CpuProjection(torch.autograd.Function):

@@ -98,8 +98,8 @@ def _monitor(path: Path, intensity: str, case: Case, camera: Camera) -> Picture:
     image = read_image(path)
     check_matches(image, case.carm.camera, str(path))
     small = downsample(image, case.carm.camera.shape[1] // camera.shape[1]).numpy()
-    grey = -small if intensity == "log" else np.log(small.clip(1))
-    behind = grey[grey < grey.max() - 2] if intensity == "raw" else grey
-    low, high = np.percentile(behind if behind.size > grey.size / 10 else grey, [0.5, 95])
-    shown = ((grey - low) / max(high - low, 1e-6) * 255).clip(0, 255).astype(np.uint8)
+    attenuation = small if intensity == "log" else -np.log(small.clip(1) / small.max())
+    body = attenuation[attenuation > 0.15 * attenuation.max()]  # the direct beam must not set the window
+    low, high = np.percentile(body, [1, 99.8])
+    shown = ((high - attenuation) / max(high - low, 1e-6) * 255).clip(0, 255).astype(np.uint8)
     return np.repeat(shown[..., None], 3, axis=2)

@@ -1,0 +1,149 @@
+"""The projector on CUDA, by Triton: what the operator calls. No call waits for the device.
+
+Without a GPU the same functions run on CPU tensors through Triton's interpreter (`TRITON_INTERPRET=1`), slowly: the
+tests check the kernels in this way wherever they run.
+"""
+
+import functools
+import importlib
+import importlib.util
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from femoreg_torch.drr.bricks import RIM
+from femoreg_torch.drr.device_bricks import bricked_on_device, padded_shape
+from femoreg_torch.geometry.camera import Camera
+from femoreg_torch.volume.grid import Volume
+
+_TILE = 8  # rays along the edge of a tile
+_WARPS = 1  # per tile, so that its rays agree on a leap without a barrier
+_MOST_VOXELS = 2**31  # the kernels count voxels in int32
+
+
+def why_not(volume: Volume) -> str | None:
+    """Why these kernels cannot render a volume, in one line; None if they can."""
+    device = volume.data.device
+    if device.type != "cuda":
+        return f"the volume is on {device}, not on a CUDA device"
+    return _no_triton() or _too_old(device) or _too_large(volume)
+
+
+@functools.cache
+def _no_triton() -> str | None:
+    if importlib.util.find_spec("triton") is None:
+        return "Triton is not installed"
+    try:
+        _kernels()
+    except ImportError as error:
+        return f"Triton cannot be imported: {error}"
+    return None
+
+
+def _too_old(device: torch.device) -> str | None:
+    major, minor = torch.cuda.get_device_capability(device)
+    return f"{device} has compute capability {major}.{minor}, Triton needs 7.0" if major < 7 else None
+
+
+def _too_large(volume: Volume) -> str | None:
+    depth, height, width = padded_shape(volume.data.shape)
+    voxels = depth * height * width
+    return f"the volume has {voxels} voxels with its rim, the kernels can count 2³¹" if voxels >= _MOST_VOXELS else None
+
+
+def project(volume: Volume, affines: Tensor, camera: Camera, step_mm: float) -> Tensor:
+    """Line integrals (B, H, W) float32 of a volume for `affines` (B, 3, 4) float64, index from camera mm.
+
+    Differentiable in `affines`, and in the volume's data, which may be float16 or bfloat16: sums are float32 all the
+    same. The gradient by `affines` is the same in every run, that by the data to rounding only (it needs atomics). A
+    pose that is not finite gives an image of nan: to raise an error would mean to wait for the device.
+    """
+    image: Tensor = _Projection.apply(volume.data, affines, volume, camera, step_mm)
+    return image
+
+
+def jacobian(volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, step_mm: float) -> tuple[Tensor, Tensor]:
+    """Line integrals (B, H, W) and their derivatives (B, H, W, n).
+
+    `changes` (B, n, 3, 4) are the derivatives of `affines` (B, 3, 4) with respect to the n parameters, all float64.
+    """
+    image = volume.data.new_empty((len(affines), *camera.shape), dtype=torch.float32)
+    derivatives = image.new_empty((*image.shape, changes.shape[1]))
+    outputs = (changes.contiguous(), changes.shape[1], image, derivatives)
+    _launch(_kernels().jacobian, _contents(volume), volume, affines, camera, step_mm, outputs)
+    return image, derivatives
+
+
+class _Projection(torch.autograd.Function):
+    """The kernels as an autograd function of the volume's data and of index-from-camera affines (B, 3, 4)."""
+
+    @staticmethod
+    def forward(ctx: Any, data: Tensor, affines: Tensor, volume: Volume, camera: Camera, step_mm: float) -> Tensor:
+        ctx.save_for_backward(affines)
+        ctx.volume, ctx.camera, ctx.step_mm = volume, camera, step_mm
+        image = data.new_empty((len(affines), *camera.shape), dtype=torch.float32)
+        _launch(_kernels().forward, _contents(volume), volume, affines, camera, step_mm, (image,))
+        return image
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        (affines,) = ctx.saved_tensors
+        scene = (ctx.volume, affines, ctx.camera, ctx.step_mm)
+        weights = upstream.to(torch.float32).contiguous()
+        data_gradient = affine_gradient = None
+        if ctx.needs_input_grad[0]:
+            shape = ctx.volume.data.shape
+            padded = weights.new_zeros(padded_shape(shape))
+            _launch(_kernels().volume_gradient, (), *scene, (weights, padded))
+            data_gradient = padded[tuple(slice(RIM, RIM + n) for n in shape)]
+        if ctx.needs_input_grad[1]:
+            parts = affines.new_empty((len(affines), _tiles(ctx.camera), 3, 4))
+            _launch(_kernels().pose_gradient, _contents(ctx.volume), *scene, (weights, parts))
+            affine_gradient = parts.sum(1)
+        return data_gradient, affine_gradient, None, None, None
+
+
+@functools.cache
+def _kernels() -> ModuleType:
+    return importlib.import_module("femoreg_torch.drr.triton_kernels")
+
+
+def _tiles(camera: Camera) -> int:
+    rows, columns = camera.shape
+    return -(-rows // _TILE) * -(-columns // _TILE)
+
+
+def _contents(volume: Volume) -> tuple[Tensor, Tensor]:
+    bricks = bricked_on_device(volume)
+    return bricks.padded, bricks.leap
+
+
+def _launch(
+    kernel: Any,
+    contents: tuple[Tensor, ...],
+    volume: Volume,
+    affines: Tensor,
+    camera: Camera,
+    step_mm: float,
+    outputs: tuple[Tensor | int, ...],
+) -> None:
+    """Run a kernel, one program per tile and pose; all take these arguments in this order."""
+    geometry = torch.tensor([camera.sdd_mm, *camera.pixel_mm, *camera.principal_point_px, step_mm], dtype=torch.float64)
+    padded_affines = affines.detach().to(torch.float64, memory_format=torch.contiguous_format, copy=True)
+    padded_affines[:, :, 3] += RIM
+    with torch.cuda.device_of(volume.data):  # Triton launches on the current device
+        kernel[(_tiles(camera), len(affines))](
+            *contents,
+            padded_affines,
+            geometry.to(affines.device, non_blocking=True),
+            *padded_shape(volume.data.shape),
+            *camera.shape,
+            *outputs,
+            tile=_TILE,
+            num_warps=_WARPS,
+            enable_fp_fusion=True,
+        )
