@@ -28,7 +28,8 @@ def draw_curves(events: Path, picture: Path) -> None:
     accuracy.set(xlabel="step", ylabel="share, validation", ylim=(0, 1))
     for axes in (losses, accuracy):
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=7)
+        if axes.get_lines():
+            axes.legend(fontsize=7)
     with temporary_file(picture) as part:
         figure.savefig(part, dpi=90)
 

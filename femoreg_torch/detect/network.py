@@ -12,7 +12,7 @@ from femoreg_torch.detect.normalise import normalise
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera
 
-VISIBLE = 0.5  # confidence from which a landmark counts as seen
+VISIBLE = 0.4  # confidence from which a landmark counts as seen; chosen on the patient that validated the training
 
 
 @dataclass(frozen=True)

@@ -221,54 +221,12 @@ def _forward(padded, leap, affines, detector, step, edges, workers, out):  # typ
                                     total += _integral(
                                         flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
                                     )
-                                out[pose, row, column] += np.float32(step) * total
+                                out[pose, row, column] = np.float32(step) * total
 
 
 @_parallel
-def _derivative(padded, leap, affines, detector, step, edges, workers, upstream, parts):  # type: ignore[no-untyped-def]
-    poses, rows, columns = upstream.shape
-    flat = padded.reshape(-1)
-    height, width = padded.shape[1], padded.shape[2]
-    for worker in nb.prange(workers):
-        starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
-        for pose in range(poses):
-            affine, edge = affines[pose], edges[pose]
-            source, mine = affine[:, 3], parts[worker, pose]
-            first_top, first_left = _first_packet(detector[4], edge), _first_packet(detector[3], edge)
-            bands = -(-(rows - first_top) // edge)
-            for band in range((worker + pose) % workers, bands, workers):
-                top = first_top + band * edge
-                for left in range(first_left, columns, edge):
-                    middle_row, middle_column = top + (edge - 1) / 2, left + (edge - 1) / 2
-                    _, _, _, dx, dy, dz = _ray(affine, detector, middle_row, middle_column)
-                    n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
-                    if n > 0:
-                        for row in range(max(top, 0), min(top + edge, rows)):
-                            for column in range(max(left, 0), min(left + edge, columns)):
-                                weight = step * upstream[pose, row, column]
-                                if weight != 0.0:
-                                    x, y, z, dx, dy, dz = _ray(affine, detector, row, column)
-                                    for i in range(n):
-                                        sx, sy, sz, tx, ty, tz, _ = _moments(
-                                            flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
-                                        )
-                                        mine[0, 0] += weight * tx * x
-                                        mine[0, 1] += weight * tx * y
-                                        mine[0, 2] += weight * tx * z
-                                        mine[0, 3] += weight * sx
-                                        mine[1, 0] += weight * ty * x
-                                        mine[1, 1] += weight * ty * y
-                                        mine[1, 2] += weight * ty * z
-                                        mine[1, 3] += weight * sy
-                                        mine[2, 0] += weight * tz * x
-                                        mine[2, 1] += weight * tz * y
-                                        mine[2, 2] += weight * tz * z
-                                        mine[2, 3] += weight * sz
-
-
-@_parallel
-def _jacobian(padded, leap, affines, changes, detector, step, edges, workers, image, out):  # type: ignore[no-untyped-def]
-    poses, rows, columns, dofs = out.shape
+def _with_moments(padded, leap, affines, detector, step, edges, workers, image, moments):  # type: ignore[no-untyped-def]
+    poses, rows, columns = image.shape
     flat = padded.reshape(-1)
     height, width = padded.shape[1], padded.shape[2]
     for worker in nb.prange(workers):
@@ -287,7 +245,7 @@ def _jacobian(padded, leap, affines, changes, detector, step, edges, workers, im
                     if n > 0:
                         for row in range(max(top, 0), min(top + edge, rows)):
                             for column in range(max(left, 0), min(left + edge, columns)):
-                                x, y, z, dx, dy, dz = _ray(affine, detector, row, column)
+                                _, _, _, dx, dy, dz = _ray(affine, detector, row, column)
                                 sx = sy = sz = tx = ty = tz = total = 0.0
                                 for i in range(n):
                                     ax, ay, az, bx, by, bz, value = _moments(
@@ -301,16 +259,9 @@ def _jacobian(padded, leap, affines, changes, detector, step, edges, workers, im
                                     tz += bz
                                     total += value
                                 image[pose, row, column] = step * total
-                                for dof in range(dofs):
-                                    c = changes[pose, dof]
-                                    out[pose, row, column, dof] = step * (
-                                        tx * (c[0, 0] * x + c[0, 1] * y + c[0, 2] * z)
-                                        + ty * (c[1, 0] * x + c[1, 1] * y + c[1, 2] * z)
-                                        + tz * (c[2, 0] * x + c[2, 1] * y + c[2, 2] * z)
-                                        + sx * c[0, 3]
-                                        + sy * c[1, 3]
-                                        + sz * c[2, 3]
-                                    )
+                                mine = moments[pose, row, column]
+                                mine[0], mine[1], mine[2] = step * sx, step * sy, step * sz
+                                mine[3], mine[4], mine[5] = step * tx, step * ty, step * tz
 
 
 @_parallel
@@ -364,50 +315,25 @@ def _packet_edges(volume: BrickedVolume, affines: Array, camera: Camera) -> NDAr
     return np.clip(1 + (SPREAD * math.sqrt(2) / per_pixel).astype(np.int64), 1, _MOST_RAYS)
 
 
-def add_projection(
-    volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float, image: NDArray[np.float32]
-) -> None:
-    """Add to `image` (B, H, W) the line integrals of one volume for `affines` (B, 3, 4), index from camera mm."""
-    edges = _packet_edges(volume, affines, camera)
-    padded = _padded_affines(affines)
-    _forward(volume.padded, volume.leap, padded, _detector(camera), step_mm, edges, nb.get_num_threads(), image)
-
-
-def pose_gradient(
-    volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float, upstream: NDArray[np.float32]
-) -> Array:
-    """Gradient (B, 3, 4) of Σ upstream · image with respect to `affines`; `upstream` is (B, H, W)."""
-    edges = _packet_edges(volume, affines, camera)
-    workers = nb.get_num_threads()
-    parts = np.zeros((workers, *affines.shape))
-    padded = _padded_affines(affines)
-    _derivative(volume.padded, volume.leap, padded, _detector(camera), step_mm, edges, workers, upstream, parts)
-    return np.asarray(parts.sum(0))
-
-
-def jacobian(
-    volume: BrickedVolume, affines: Array, changes: Array, camera: Camera, step_mm: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Line integrals (B, H, W) and their derivatives (B, H, W, n).
-
-    `changes` (B, n, 3, 4) are the derivatives of `affines` (B, 3, 4) with respect to the n parameters.
-    """
+def projection(volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float) -> NDArray[np.float32]:
+    """Line integrals (B, H, W) of one volume for `affines` (B, 3, 4), index from camera mm."""
     edges = _packet_edges(volume, affines, camera)
     image = np.zeros((len(affines), *camera.shape), np.float32)
-    derivatives = np.zeros((*image.shape, changes.shape[1]), np.float32)
-    _jacobian(
-        volume.padded,
-        volume.leap,
-        _padded_affines(affines),
-        np.ascontiguousarray(changes),
-        _detector(camera),
-        step_mm,
-        edges,
-        nb.get_num_threads(),
-        image,
-        derivatives,
-    )
-    return image, derivatives
+    padded = _padded_affines(affines)
+    _forward(volume.padded, volume.leap, padded, _detector(camera), step_mm, edges, nb.get_num_threads(), image)
+    return image
+
+
+def projection_with_moments(
+    volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Line integrals (B, H, W), and the moments (B, H, W, 6) that hold their derivatives (`drr.moments`)."""
+    edges = _packet_edges(volume, affines, camera)
+    image = np.zeros((len(affines), *camera.shape), np.float32)
+    moments = np.zeros((*image.shape, 6), np.float32)
+    padded, workers = _padded_affines(affines), nb.get_num_threads()
+    _with_moments(volume.padded, volume.leap, padded, _detector(camera), step_mm, edges, workers, image, moments)
+    return image, moments
 
 
 def volume_gradient(

@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from femoreg_torch.drr import cpu, cuda
 from femoreg_torch.drr.bricks import bricked
+from femoreg_torch.drr.moments import affine_gradient, jacobian
 from femoreg_torch.drr.reference import march
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry.camera import Camera
@@ -60,11 +61,11 @@ def project_with_jacobian(
     with torch.no_grad():
         index_from_camera = _index_from_camera(volume, camera_from_volume)
         affines = index_from_camera[:, :3]
-        # A small motion of the object changes where a camera point lies in it as the opposite motion of the point would.
+        # To move the object is to move the camera's points in it the other way.
         changes = -affines[:, None] @ _twist_generators(centre.to(index_from_camera))
     if volume.data.device.type == "cpu":
-        image, jacobian = cpu.jacobian(bricked(volume), affines.numpy(), changes.numpy(), camera, step_mm)
-        return torch.from_numpy(image), torch.from_numpy(jacobian)
+        image, moments = cpu.projection_with_moments(bricked(volume), affines.numpy(), camera, step_mm)
+        return torch.from_numpy(image), jacobian(torch.from_numpy(moments), camera, changes)
     if reason := cuda.why_not(volume):
         raise InputError(f"project_with_jacobian: {reason}. Move the volume to the CPU, or use Triton on CUDA.")
     return cuda.jacobian(volume, affines, changes, camera, step_mm)
@@ -122,21 +123,24 @@ class _CpuProjection(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, data: Tensor, affines: Tensor, volume: Volume, camera: Camera, step_mm: float) -> Tensor:
-        ctx.save_for_backward(affines)
         ctx.volume, ctx.camera, ctx.step_mm = volume, camera, step_mm
-        image = torch.zeros((len(affines), *camera.shape))
-        cpu.add_projection(bricked(volume), affines.detach().numpy(), camera, step_mm, image.numpy())
-        return image
+        numbers, moments = affines.detach().numpy(), None
+        if ctx.needs_input_grad[1]:  # one walk along the rays gives image and derivatives
+            image, moments = cpu.projection_with_moments(bricked(volume), numbers, camera, step_mm)
+        else:
+            image = cpu.projection(bricked(volume), numbers, camera, step_mm)
+        ctx.save_for_backward(affines, None if moments is None else torch.from_numpy(moments))
+        return torch.from_numpy(image)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (affines,) = ctx.saved_tensors
-        volume, camera, step_mm = bricked(ctx.volume), ctx.camera, ctx.step_mm
-        weights, poses = upstream.to(torch.float32).contiguous().numpy(), affines.detach().numpy()
-        data_gradient = affine_gradient = None
+        affines, moments = ctx.saved_tensors
+        weights = upstream.to(torch.float32)
+        data_gradient = pose_gradient = None
         if ctx.needs_input_grad[0]:
-            data_gradient = torch.from_numpy(cpu.volume_gradient(volume, poses, camera, step_mm, weights))
-        if ctx.needs_input_grad[1]:
-            affine_gradient = torch.from_numpy(cpu.pose_gradient(volume, poses, camera, step_mm, weights))
-        return data_gradient, affine_gradient, None, None, None
+            numbers = affines.detach().numpy(), ctx.camera, ctx.step_mm, weights.contiguous().numpy()
+            data_gradient = torch.from_numpy(cpu.volume_gradient(bricked(ctx.volume), *numbers))
+        if moments is not None:
+            pose_gradient = affine_gradient(moments, ctx.camera, weights)
+        return data_gradient, pose_gradient, None, None, None

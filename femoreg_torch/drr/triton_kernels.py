@@ -1,14 +1,13 @@
 # mypy: disable-error-code="no-untyped-def"
 """The projector's kernels in Triton. Importing this module imports Triton; only `cuda.py` does, and only when needed.
 
-One program renders a square tile of `tile` × `tile` rays of one pose. As on the CPU, a ray is `source + t · direction` in
-padded index space, and its samples lie at whole multiples of the step. What decides where a sample lies is computed in
-float64 once per ray; after that the ray counts in float32 voxels from the corner of the voxel it enters by, so that
-indices of a thousand cost no accuracy. All rays of a tile are at the same sample number, and leap together: as far as
-the one that may leap least.
+One program renders a square tile of rays of one pose. As on the CPU, a ray is `source + t · direction` in padded index
+space, and its samples lie at whole multiples of the step. What decides where a sample lies is computed in float64, once
+per ray; from there on the ray counts in float32 voxels from the voxel it enters by, so that indices of a thousand cost
+no accuracy. All rays of a tile are at the same sample number, and leap together, as far as the one that may leap least.
 
 Tensors, all contiguous: `affines` (B, 3, 4) float64, padded index from camera mm; `geometry` (6,) float64, see
-`_rays`; `volume` (depth, height, width) in any float type; `leap` uint8, one per brick, see `bricks.py`.
+`_unit_rays`; `volume` (depth, height, width) in any float type; `leap` uint8, one per brick, see `bricks.py`.
 """
 
 import triton

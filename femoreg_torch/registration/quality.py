@@ -41,7 +41,7 @@ class ObjectQuality:
     """One object in all views."""
 
     views: tuple[ViewQuality, ...]
-    uncertainty_mm: float  # root mean square disagreement of the views in their image planes
+    in_plane_uncertainty_mm: float  # root mean square disagreement of the views in their image planes
     trusted: bool
     reason: str
 

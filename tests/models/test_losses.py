@@ -47,7 +47,7 @@ def test_target_is_a_distribution_with_its_mean_on_the_landmark() -> None:
 
 
 def test_landmark_loss_by_hand() -> None:
-    """A flat distribution over n entries: ln n for an absent landmark, ln n less the target's entropy for a seen one."""
+    """A flat distribution over n entries: ln n for an absent landmark, less the entropy of the target if seen."""
     pixels, visible = torch.tensor([[[10.0, 10.0]]]), torch.tensor([[True]])
     heatmaps, absence = torch.zeros(1, 1, 24, 24), torch.zeros(1, 1)
     flat = math.log(24 * 24 + 1)

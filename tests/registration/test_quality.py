@@ -24,7 +24,7 @@ def scene() -> Scene:
 def test_the_truth_is_trusted(scene: Scene) -> None:
     for name, found in assess(scene, TRUTH, LIMITS).items():
         assert found.trusted, (name, found)
-        assert found.uncertainty_mm < 0.3
+        assert found.in_plane_uncertainty_mm < 0.3
         assert len(found.views) == 3
 
 

@@ -1,5 +1,6 @@
 """Learning on a CPU in seconds: one batch by heart, and one run from a case folder to exported weights."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -59,6 +60,16 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Layers this small are slower on several threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.usefixtures("one_thread")
 def test_one_batch_can_be_learned_by_heart() -> None:
     torch.manual_seed(1)
     network = UNet(UNetConfig(channels=(16, 24, 32), convolutions=(1, 1, 1)))

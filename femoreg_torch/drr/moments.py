@@ -1,0 +1,37 @@
+"""Derivatives of an image by its pose, from two moments per ray.
+
+A sample lies at x = A u t + b in index space, with the unit ray u, the distance t from the source, the affine (A | b).
+For an image I = step · Σ_k V(x_k) the chain rule gives ∂I/∂b = step · Σ ∇V and ∂I/∂A = step · Σ t ∇V uᵀ. So the moments
+(step · Σ ∇V, step · Σ t ∇V), six numbers per pixel, hold every derivative with respect to any pose parameter.
+"""
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.geometry.camera import Camera
+
+
+def unit_rays(camera: Camera) -> Tensor:
+    """Unit vectors (H, W, 3) float32 from the source through the pixel centres."""
+    positions = camera.pixel_positions()
+    return (positions / positions.norm(dim=-1, keepdim=True)).to(torch.float32)
+
+
+def affine_gradient(moments: Tensor, camera: Camera, upstream: Tensor) -> Tensor:
+    """Gradient (B, 3, 4) float64 of Σ upstream · image by the affines; moments (B, H, W, 6), upstream (B, H, W)."""
+    weighted = (moments * upstream[..., None]).flatten(1, 2)  # (B, H · W, 6)
+    rays = unit_rays(camera).flatten(0, 1)
+    linear = (weighted[..., 3:].mT @ rays).to(torch.float64)
+    return torch.cat([linear, weighted[..., :3].sum(1, dtype=torch.float64)[..., None]], -1)
+
+
+def jacobian(moments: Tensor, camera: Camera, changes: Tensor) -> Tensor:
+    """Derivatives (B, H, W, n) of images by n parameters, from moments (B, H, W, 6).
+
+    `changes` (B, n, 3, 4) are the derivatives of the affines with respect to the parameters.
+    """
+    rays = unit_rays(camera)
+    outer = moments[..., 3:, None] * rays[..., None, :]  # (B, H, W, 3, 3)
+    full = torch.cat([outer, moments[..., :3, None]], -1).flatten(-2).flatten(1, 2)  # (B, H · W, 12)
+    columns = full @ changes.to(full.dtype).flatten(-2).mT
+    return columns.unflatten(1, moments.shape[1:3])
