@@ -23,7 +23,7 @@ class GradNcc:
     scale: Tensor  # (2, H − 2r, W − 2r): 1 / √Σ(f − mean)², 0 where flat
     weights: Tensor  # (H − 2r, W − 2r), summing to one
     radius: int
-    smoothing_px: float
+    taps: tuple[Tensor, Tensor]  # of the derivative, see `derivative_taps`
 
     def __call__(self, images: Tensor) -> Tensor:
         """Costs (B,) in [0, 2] of images (B, H, W), float64: mean over patches and both derivatives of 1 − NCC."""
@@ -39,7 +39,7 @@ class GradNcc:
 
     def _reference(self, images: Tensor) -> Tensor:
         """Weighted mean NCC (B,) in plain torch."""
-        moving = image_gradients(images, self.smoothing_px)
+        moving = image_gradients(images, self.taps)
         n = (2 * self.radius + 1) ** 2
         sums = patch_sums(moving, self.radius)
         spread = patch_sums(moving**2, self.radius) - sums**2 / n
@@ -63,13 +63,14 @@ def grad_ncc(fixed: Tensor, radius: int, smoothing_px: float = 1.1, weights: Ten
         raise InputError(f"similarity: no patch of radius {radius} fits into a {height} × {width} image.")
     if weights is not None and not (weights > 0).any():
         raise InputError("similarity: all pixel weights are zero; the mask leaves nothing to compare.")
-    maps = image_gradients(fixed[None], smoothing_px)[0]
+    taps = derivative_taps(smoothing_px, fixed.device)
+    maps = image_gradients(fixed[None], taps)[0]
     n = (2 * radius + 1) ** 2
     mean = patch_sums(maps, radius) / n
     spread = patch_sums(maps**2, radius) - n * mean**2
     scale = torch.where(spread > _FLAT, spread.clamp(min=_FLAT).rsqrt(), torch.zeros_like(spread))
     share = patch_weights(weights, (height, width), radius).to(mean.device)
-    return GradNcc(maps, mean, scale, share, radius, smoothing_px)
+    return GradNcc(maps, mean, scale, share, radius, taps)
 
 
 class _CpuGradNcc(torch.autograd.Function):
@@ -77,7 +78,7 @@ class _CpuGradNcc(torch.autograd.Function):
 
     @staticmethod
     def _arguments(similarity: GradNcc) -> tuple[Any, ...]:
-        average, slope = (taps.float().numpy() for taps in derivative_taps(similarity.smoothing_px))
+        average, slope = (taps.float().numpy() for taps in similarity.taps)
         numbers = (t.numpy() for t in (similarity.fixed, similarity.mean, similarity.scale, similarity.weights))
         return *numbers, similarity.radius, _FLAT, average, slope
 

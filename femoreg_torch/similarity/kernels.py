@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 
-def derivative_taps(smoothing_px: float) -> tuple[Tensor, Tensor]:
+def derivative_taps(smoothing_px: float, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
     """Taps (K,) float64 across and along a derivative: Sobel's [1, 2, 1] / 4 and [−1, 0, 1] / 2, each smoothed.
 
     `smoothing_px` is the standard deviation of a Gaussian that is folded in (cut at 2 σ, at least 1 px); 0 for none.
@@ -15,7 +15,7 @@ def derivative_taps(smoothing_px: float) -> tuple[Tensor, Tensor]:
     average = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64) / 4
     slope = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64) / 2
     if smoothing_px == 0:
-        return average, slope
+        return average.to(device), slope.to(device)
     reach = max(1, math.ceil(2 * smoothing_px - 0.5))
     x = torch.arange(-reach, reach + 1, dtype=torch.float64)
     gauss = torch.exp(-0.5 * (x / smoothing_px) ** 2)
@@ -24,12 +24,15 @@ def derivative_taps(smoothing_px: float) -> tuple[Tensor, Tensor]:
     def fold(taps: Tensor) -> Tensor:
         return F.conv1d(taps[None, None], gauss.flip(0)[None, None], padding=2 * reach)[0, 0]
 
-    return fold(average), fold(slope)
+    return fold(average).to(device), fold(slope).to(device)
 
 
-def image_gradients(images: Tensor, smoothing_px: float) -> Tensor:
-    """Derivatives (B, 2, H, W) per pixel, along columns then along rows, of images (B, H, W); edges are replicated."""
-    average, slope = (taps.to(images) for taps in derivative_taps(smoothing_px))
+def image_gradients(images: Tensor, taps: tuple[Tensor, Tensor]) -> Tensor:
+    """Derivatives (B, 2, H, W) per pixel, along columns then along rows, of images (B, H, W); edges are replicated.
+
+    `taps` are those of `derivative_taps`; kept on the images' device they need no copy per call.
+    """
+    average, slope = (t.to(images) for t in taps)
     reach = len(average) // 2
     padded = F.pad(images[:, None], (reach, reach, reach, reach), mode="replicate")
     along_columns = F.conv2d(F.conv2d(padded, slope[None, None, None, :]), average[None, None, :, None])

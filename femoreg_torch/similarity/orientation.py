@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.similarity.kernels import image_gradients
+from femoreg_torch.similarity.kernels import derivative_taps, image_gradients
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +16,7 @@ class GradientOrientation:
     fixed: Tensor  # (2, H, W) derivatives
     strong: Tensor  # (H, W) bool: edges of the fixed image that count
     weights: Tensor  # (H, W)
-    smoothing_px: float
+    taps: tuple[Tensor, Tensor]  # of the derivative, see `derivative_taps`
 
     def __call__(self, images: Tensor) -> Tensor:
         """Costs (B,) in [0, 1] of images (B, H, W): one minus the mean agreement of the directions.
@@ -27,7 +27,7 @@ class GradientOrientation:
             raise InputError(
                 f"similarity: images are {tuple(images.shape[1:])}, the fixed one {tuple(self.fixed.shape[1:])}."
             )
-        moving = image_gradients(images, self.smoothing_px)  # (B, 2, H, W)
+        moving = image_gradients(images, self.taps)  # (B, 2, H, W)
         strength = moving.detach().square().sum(1)
         counts = self.strong & (strength > strength.flatten(1).median(1).values[:, None, None]) & (strength > 0)
         dot = (moving * self.fixed).sum(1)
@@ -48,10 +48,11 @@ def gradient_orientation(
     in the moving one; De Silva et al., 3D–2D image registration for target localization in spine surgery, Phys. Med.
     Biol. 61 (2016) 3009. `weights` (H, W) say where to look. Raises `InputError` if the fixed image has no edge there.
     """
-    maps = image_gradients(fixed[None], smoothing_px)[0]
+    taps = derivative_taps(smoothing_px, fixed.device)
+    maps = image_gradients(fixed[None], taps)[0]
     strength = maps.square().sum(0)
     strong = (strength > strength.median()) & (strength > 0)
     share = torch.ones_like(fixed) if weights is None else weights.to(fixed)
     if not (strong & (share > 0)).any():
         raise InputError("similarity: the fixed image has no edge where it is to be compared.")
-    return GradientOrientation(maps, strong, share, smoothing_px)
+    return GradientOrientation(maps, strong, share, taps)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.similarity import grad_ncc
-from femoreg_torch.similarity.kernels import image_gradients, patch_sums
+from femoreg_torch.similarity.kernels import derivative_taps, image_gradients, patch_sums
 
 
 def picture(seed: int, height: int = 40, width: int = 33) -> Tensor:
@@ -37,7 +37,7 @@ def test_equals_the_literal_definition() -> None:
 
 def test_derivatives_equal_a_smoothed_sobel_away_from_the_border() -> None:
     image = picture(2)
-    dx, dy = image_gradients(image[None].double(), 1.1)[0].numpy()
+    dx, dy = image_gradients(image[None].double(), derivative_taps(1.1))[0].numpy()
     smooth = cv2.GaussianBlur(image.numpy().astype(np.float64), (5, 5), 1.1)
     inside = np.s_[4:-4, 4:-4]
     np.testing.assert_allclose(dx[inside], (cv2.Sobel(smooth, cv2.CV_64F, 1, 0) / 8)[inside], atol=1e-9)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.similarity import grad_ncc, gradient_orientation, ncc
-from femoreg_torch.similarity.kernels import image_gradients
+from femoreg_torch.similarity.kernels import derivative_taps, image_gradients
 
 
 def picture(seed: int, height: int = 36, width: int = 30) -> Tensor:
@@ -79,7 +79,7 @@ def test_patch_ncc_of_the_only_patch_equals_the_whole_image() -> None:
 
 def test_orientation_equals_angles_compared_pixel_by_pixel() -> None:
     fixed, moving = picture(13), picture(14)
-    (fx, fy), (mx, my) = (image_gradients(i[None], 1.1)[0].numpy() for i in (fixed, moving))
+    (fx, fy), (mx, my) = (image_gradients(i[None], derivative_taps(1.1))[0].numpy() for i in (fixed, moving))
     strong = np.hypot(fx, fy) > np.median(np.hypot(fx, fy))
     both = strong & (np.hypot(mx, my) > np.median(np.hypot(mx, my)))
     turn = np.arctan2(my, mx) - np.arctan2(fy, fx)
