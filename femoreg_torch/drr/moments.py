@@ -19,10 +19,13 @@ def unit_rays(camera: Camera) -> Tensor:
 
 def affine_gradient(moments: Tensor, camera: Camera, upstream: Tensor) -> Tensor:
     """Gradient (B, 3, 4) float64 of Σ upstream · image by the affines; moments (B, H, W, 6), upstream (B, H, W)."""
-    weighted = (moments * upstream[..., None]).flatten(1, 2)  # (B, H · W, 6)
     rays = unit_rays(camera).flatten(0, 1)
-    linear = (weighted[..., 3:].mT @ rays).to(torch.float64)
-    return torch.cat([linear, weighted[..., :3].sum(1, dtype=torch.float64)[..., None]], -1)
+    gradients = []
+    for of_pose, weights in zip(moments, upstream, strict=True):  # one by one: all at once would take the memory again
+        weighted = (of_pose * weights[..., None]).flatten(0, 1)  # (H · W, 6)
+        shift = weighted[:, :3].sum(0, dtype=torch.float64)
+        gradients.append(torch.cat([(weighted[:, 3:].mT @ rays).to(torch.float64), shift[:, None]], 1))
+    return torch.stack(gradients)
 
 
 def jacobian(moments: Tensor, camera: Camera, changes: Tensor) -> Tensor:

@@ -45,7 +45,9 @@ def project(
         _project_one(volume, _index_from_camera(volume, camera_from_volume[:, v]), camera, step_mm)
         for v, volume in enumerate(volumes)
     ]
-    return torch.stack(images, 1) if separate else torch.stack(images).sum(0)
+    if separate:
+        return torch.stack(images, 1)
+    return functools.reduce(torch.add, images)
 
 
 def project_with_jacobian(
