@@ -12,7 +12,8 @@ def register(case: Path, *, out: Path, preset: str = "demo", seed: int = 0, weig
     Args:
         case: Case folder with case.yaml.
         out: Folder to write the result to.
-        preset: Workflow in configs/registration: `demo` (coarse and quick) or `paper` (the published budgets).
+        preset: Workflow in configs/registration: `demo` (coarse and quick) or `paper` (images and
+            optimisers of the paper, minutes).
         seed: Of the random searches; the same seed gives the same result.
         weights: Weights of the landmark network, if not those shipped (safetensors).
     """

@@ -11,9 +11,9 @@ TRUTH = true_poses()
 LIMITS = Limits()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def whole_pixels() -> None:
-    quality._LEVEL = Level(downsample=1, step_mm=2.0, patch_radius=4)
+@pytest.fixture(autouse=True)
+def whole_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quality, "_LEVEL", Level(downsample=1, step_mm=2.0, patch_radius=4))
 
 
 @pytest.fixture(scope="module")
