@@ -25,6 +25,8 @@ lint: setup
 
 bench: setup
 	$(BIN)/python benchmarks/drr.py
+	$(BIN)/python benchmarks/scaling.py
 
 bench-gpu: setup
 	$(BIN)/python benchmarks/drr.py --device cuda
+	$(BIN)/python benchmarks/scaling.py --device cuda

@@ -3,7 +3,7 @@
     python benchmarks/drr.py [--case FOLDER] [--device cpu|cuda] [--seconds 5] [--peer-poses 4]
 
 The case folder needs ct.nii.gz and labels.nii.gz (1 left hip, 2 right hip, 4 sacrum); without one a phantom serves.
-Every row is measured in a process of its own. Writes benchmarks/RESULTS.md and benchmarks/drr_scaling.png.
+Every row is measured in a process of its own. Writes benchmarks/RESULTS.md.
 """
 
 import argparse
@@ -13,9 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from matplotlib.figure import Figure
 from measure import (
-    RESULTS,
     Timing,
     in_own_process,
     machine,
@@ -29,16 +27,13 @@ from renderers import RENDERERS
 from scene import CAMERA, default_case, pelvis, poses
 from torch import Tensor
 
-from femoreg_torch.drr import project, project_with_jacobian
+from femoreg_torch.drr import project_with_jacobian
 from femoreg_torch.drr.reference import march
-from femoreg_torch.geometry import Camera, load_carm
 from femoreg_torch.volume.grid import Volume, axis_aligned
 
 _COARSE = CAMERA.window(
     slice(4, None, 8), slice(4, None, 8)
 )  # every 8th pixel, 2,304 in all, where the error is measured
-_SIDES = (96, 192, 384, 768, 1536)
-_BATCHES = (1, 2, 4, 8, 16, 32, 64)
 
 
 @dataclass(frozen=True)
@@ -134,42 +129,6 @@ def ratios(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
-def scaling(volume: Volume, device: str, seconds: float) -> tuple[list[float], list[float]]:
-    """Forward milliseconds over image sides at one pose, and over batch sizes at 384 × 384."""
-    whole = load_carm("cios_fusion").camera
-    posed = Volume(volume.data.to(device), volume.lps_from_index)
-
-    def milliseconds(camera: Camera, count: int) -> float:
-        many = poses(volume, count)[:, None].to(device)
-        return 1e3 * measure(lambda: project([posed], many, camera), device, seconds / 4).median
-
-    sides = [milliseconds(whole.downsampled(1536 // side), 1) for side in _SIDES]
-    return sides, [milliseconds(CAMERA, count) for count in _BATCHES]
-
-
-def plot_scaling(sides: list[float], batches: list[float], path: Path) -> None:
-    """Time over pixels and over poses, with the line of proportionality through the 384 × 384 image of one pose."""
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for axes, count, times, unit in (
-        (left, [side**2 for side in _SIDES], sides, 384**2),
-        (right, list(_BATCHES), batches, 1),
-    ):
-        through = times[count.index(unit)]
-        axes.loglog(count, times, "o-", label="FemoReg Torch")
-        axes.loglog(count, [through * n / unit for n in count], "k:", label="proportional")
-        axes.set_ylabel("forward, ms (median)")
-        axes.grid(visible=True, which="major", alpha=0.3)
-        axes.legend()
-    left.set_xlabel("pixels, one pose")
-    left.set_xticks([side**2 for side in _SIDES], [f"{side}²" for side in _SIDES], minor=False)
-    right.set_xlabel("poses, 384 × 384 pixels")
-    right.set_xticks(_BATCHES, [str(n) for n in _BATCHES])
-    for axes in (left, right):
-        axes.minorticks_off()
-    figure.savefig(path, dpi=110)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--case", type=Path, default=default_case(), help="folder with ct.nii.gz and labels.nii.gz")
@@ -181,9 +140,6 @@ def main() -> None:
     options = parser.parse_args()
     volume, name = pelvis(options.case)
     rows = comparison(volume, options.device, options.seconds, options.peer_poses)
-    sides, batches = scaling(volume, options.device, options.seconds)
-    picture = RESULTS.with_name("drr_scaling.png" if options.device == "cpu" else "drr_scaling_cuda.png")
-    plot_scaling(sides, batches, picture)
     size = " × ".join(str(n) for n in reversed(volume.data.shape))
     header = ["renderer", "task", "poses", "ms per pose: median (p10–p90)", "peak MiB", "NRMSE to float64 at 0.1 mm"]
     cells = [
@@ -198,8 +154,6 @@ def main() -> None:
         for row in rows
     ]
     peers = [p for p in ("nanodrr", "diffdrr") if missing(p) is None]
-    grow = ", ".join(f"{side}²: {t:.3g}" for side, t in zip(_SIDES, sides, strict=True))
-    batch = ", ".join(f"{n}: {t / n:.3g}" for n, t in zip(_BATCHES, batches, strict=True))
     pixel = f"{CAMERA.shape[0]} × {CAMERA.shape[1]} pixels of {CAMERA.pixel_mm[0]:g} mm"
     voxel = f"{size} voxels of {' × '.join(f'{s:.3g}' for s in volume.spacing_mm)} mm"
     text = f"""{machine(options.device, peers)}
@@ -211,11 +165,7 @@ root mean square of the march; Siddon's volume is constant within voxels, so tha
 
 {table(header, cells)}
 
-{ratios(rows)}
-
-Forward time in ms over the image side: {grow}. Time per pose in ms over the batch: {batch}.
-
-![Time over pixels and poses]({picture.name})"""
+{ratios(rows)}"""
     write_section(f"Projector on {options.device}", text)
 
 
