@@ -23,7 +23,7 @@ MAY_IMPORT = {
 # only, and `registration` takes a `Case`. `evaluation` compares a result with the case's truth, so it comes late.
 ROOMS = (
     "errors", "files", "configs", "geometry", "volume", "drr", "fluoro", "case",
-    "detect", "pnp", "similarity", "optimize", "registration", "evaluation", "commands",
+    "detect", "pnp", "similarity", "optimize", "registration", "navigation", "evaluation", "commands",
 )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from femoreg_torch.evaluation.errors import ReferencePoints, errors, reference_points
 from femoreg_torch.evaluation.overlay import draw_edges, overlay_figure
+from femoreg_torch.evaluation.replay import write_replay
 from femoreg_torch.evaluation.run import evaluate_run, poses_of
 from femoreg_torch.evaluation.table import PAPER_METRICS, PAPER_POSES, error_tables
 
@@ -16,4 +17,5 @@ __all__ = [
     "overlay_figure",
     "poses_of",
     "reference_points",
+    "write_replay",
 ]

@@ -24,7 +24,7 @@ from femoreg_torch.volume import (
     voxelise_mesh,
 )
 
-_GREEN, _RED, _MAGENTA = (0, 255, 0), (60, 60, 255), (255, 60, 255)  # blue, green, red
+GREEN, RED, _MAGENTA = (0, 255, 0), (60, 60, 255), (255, 60, 255)  # blue, green, red
 _WIDTH_PX = 512  # of one panel, or a little more: the detector is averaged over whole blocks
 _SPACING_MM = 1.0
 
@@ -40,11 +40,11 @@ def overlay_figure(case: Case, poses: Truth) -> Picture:
         camera_from_pelvis = poses.camera_from_pelvis[number]
         camera_from_camera1 = camera_from_pelvis @ invert_rigid(poses.camera_from_pelvis[0])
         camera_from_femur = camera_from_camera1 @ poses.camera1_from_femur
-        panels = [_monitor(view.anatomy, view.intensity, case, camera)]
+        panels = [monitor_picture(view.anatomy, view.intensity, case, camera)]
         draw_edges(panels[0], [(pelvis, camera_from_pelvis), (femur, camera_from_femur)], camera)
         _draw_landmarks(panels[0], case, camera_from_pelvis, camera_from_femur, camera)
         if view.device is not None and device is not None and poses.camera1_from_device is not None:
-            panels.append(_monitor(view.device, view.intensity, case, camera))
+            panels.append(monitor_picture(view.device, view.intensity, case, camera))
             draw_edges(panels[1], [(device, camera_from_camera1 @ poses.camera1_from_device)], camera)
         columns.append(panels)
     height = max(len(panels) for panels in columns)
@@ -70,12 +70,17 @@ def _structures(case: Case) -> tuple[Volume, Volume, Volume | None]:
 def draw_edges(picture: Picture, posed: Sequence[tuple[Volume, Tensor]], camera: Camera) -> None:
     """Draw the DRR edges of volumes, each with its `camera_from_volume` (4, 4), into a picture of `camera`."""
     for volume, camera_from_volume in posed:
-        image = project([volume], camera_from_volume[None, None], camera)[0].numpy()
-        if not image.any():
-            continue  # the structure lies outside this view
-        bright = np.percentile(image[image > 0], 98)
-        grey = cv2.GaussianBlur((image / bright * 255).clip(0, 255).astype(np.uint8), (0, 0), 1.2)
-        picture[cv2.Canny(grey, 30, 70) > 0] = _GREEN
+        picture[edges_of(project([volume], camera_from_volume[None, None], camera)[0])] = GREEN
+
+
+def edges_of(drawn: Tensor) -> NDArray[np.bool_]:
+    """Pixels (H, W) on an edge of a DRR (H, W); none where the structure lies outside the view."""
+    image = drawn.numpy()
+    if not image.any():
+        return np.zeros(image.shape, bool)
+    bright = np.percentile(image[image > 0], 98)
+    grey = cv2.GaussianBlur((image / bright * 255).clip(0, 255).astype(np.uint8), (0, 0), 1.2)
+    return cv2.Canny(grey, 30, 70) > 0
 
 
 def _draw_landmarks(
@@ -85,15 +90,15 @@ def _draw_landmarks(
         column, row = project_points(camera, transform_points(camera_from_pelvis, point[None]))[0].tolist()
         if 0 <= column < camera.shape[1] and 0 <= row < camera.shape[0]:
             place = (round(column), round(row))
-            cv2.drawMarker(picture, place, _RED, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA)
+            cv2.drawMarker(picture, place, RED, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA)
             beside = (place[0] + 5, place[1] - 4)
-            cv2.putText(picture, name, beside, cv2.FONT_HERSHEY_SIMPLEX, 0.35, _RED, 1, cv2.LINE_AA)
+            cv2.putText(picture, name, beside, cv2.FONT_HERSHEY_SIMPLEX, 0.35, RED, 1, cv2.LINE_AA)
     path = transform_points(camera_from_femur, torch.stack([case.entry_point, case.target]))
     start, end = project_points(camera, path).round().int().tolist()
     cv2.line(picture, start, end, _MAGENTA, 1, cv2.LINE_AA)
 
 
-def _monitor(path: Path, intensity: str, case: Case, camera: Camera) -> Picture:
+def monitor_picture(path: Path, intensity: str, case: Case, camera: Camera) -> Picture:
     """An image as a monitor shows it (bone dark), grey (H, W, 3) on the grid of `camera`."""
     image = read_image(path)
     check_matches(image, case.carm.camera, str(path))

@@ -45,12 +45,17 @@ class BestSoFar:
     def __call__(self, deltas: Tensor) -> Tensor:
         """Values (P,) of deltas (P, n)."""
         values = self._objective(deltas)
-        self.evaluations += len(deltas)
         best = int(values.argmin())
-        if float(values[best]) < self.value:
-            self.value, self.delta = float(values[best]), deltas[best].clone()
-            self.trace.append((self.evaluations, self.value, tuple(self.delta.tolist())))
+        self.evaluations += len(deltas) - 1
+        self.count(deltas[best], float(values[best]))
         return values
+
+    def count(self, delta: Tensor, value: float) -> None:
+        """Take one evaluation, made elsewhere, into account."""
+        self.evaluations += 1
+        if value < self.value:
+            self.value, self.delta = value, delta.clone()
+            self.trace.append((self.evaluations, value, tuple(delta.tolist())))
 
     def result(self, stop: Stop) -> Result:
         """The best point met so far. Raises `ArithmeticError` if no value was ever finite."""

@@ -1,17 +1,20 @@
 """The objective of a stage: mean similarity cost of a batch of candidate deltas (paper, equations 1, 3, 4)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from femoreg_torch.drr import project
+from femoreg_torch.drr import project, project_with_jacobian
 from femoreg_torch.fluoro import downsample
-from femoreg_torch.geometry import Camera
-from femoreg_torch.optimize import Objective
+from femoreg_torch.geometry import Camera, invert_rigid, transform_points
+from femoreg_torch.optimize import Quadratic, SmoothObjective
 from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, split
-from femoreg_torch.similarity import GradNcc, grad_ncc
+from femoreg_torch.similarity import GradNcc, grad_ncc, grad_ncc_quadratic
+from femoreg_torch.volume import Volume
+
+_STEP = 1e-5  # of a delta, for the derivatives of poses
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,74 @@ def _target(
     return _Target(view, camera, similarity, background, tuple(name for name in drawn if name in moves))
 
 
+@dataclass(frozen=True, eq=False)
+class ImageCosts:
+    """Similarity costs of images as functions of deltas (P, Σ n_b) of bodies; made by `image_costs`."""
+
+    volumes: dict[str, Volume]
+    centres: dict[str, Tensor]  # (3,) mm in the object's own space, see `Scene.reference_points`
+    poses: Poses
+    bodies: tuple[Body, ...]
+    step_mm: float
+    targets: tuple[_Target, ...]
+
+    def __call__(self, deltas: Tensor) -> Tensor:
+        """Costs (P, images) of deltas (P, Σ n_b)."""
+        columns = []
+        for target in self.targets:
+            drawn = target.background.expand(len(deltas), *target.camera.shape)
+            if target.moving:
+                volumes = [self.volumes[name] for name in target.moving]
+                drawn = drawn + project(volumes, self._placed(target, deltas), target.camera, self.step_mm)
+            columns.append(target.similarity(drawn))
+        return torch.stack(columns, 1)
+
+    def quadratics(self, delta: Tensor) -> list[Quadratic]:
+        """Each image's cost about one delta (Σ n_b,), with exact gradient and Gauss–Newton curvature."""
+        return [self._quadratic(target, delta) for target in self.targets]
+
+    def _placed(self, target: _Target, deltas: Tensor) -> Tensor:
+        """Poses (P, O, 4, 4) of the target's moving objects."""
+        motions = [body.motion(part) for body, part in zip(self.bodies, split(deltas, self.bodies), strict=True)]
+        placed = [
+            _camera_from(name, target.view, self.poses, self.bodies, motions, len(deltas)) for name in target.moving
+        ]
+        return torch.stack(placed, 1)
+
+    def _quadratic(self, target: _Target, delta: Tensor) -> Quadratic:
+        n = len(delta)
+        if not target.moving:
+            cost = float(target.similarity(target.background[None]))
+            return Quadratic(cost, delta.new_zeros(1, n), delta.new_zeros(n, n))
+        drawn, jacobians, twists = target.background, [], []
+        placed = self._placed(target, delta[None])[0]  # (O, 4, 4)
+        for name, pose, change in zip(target.moving, placed, self._changes(target, delta), strict=True):
+            centre = transform_points(pose, self.centres[name][None])[0]
+            image, jacobian = project_with_jacobian(self.volumes[name], pose[None], target.camera, centre, self.step_mm)
+            drawn = drawn + image[0]
+            jacobians.append(jacobian[0])
+            twists.append(_twists(change, pose, centre))
+        # Six twists per object span all that the deltas do to this image.
+        cost, scores, hessian = grad_ncc_quadratic(target.similarity, drawn, torch.cat(jacobians, -1))
+        by_delta = torch.cat(twists)  # (6 O, n)
+        return Quadratic(cost, scores @ by_delta, by_delta.T @ hessian @ by_delta)
+
+    def _changes(self, target: _Target, delta: Tensor) -> Tensor:
+        """Derivatives (O, n, 4, 4) of the poses by the deltas, by central differences, good to some 1e-9."""
+        steps = _STEP * torch.eye(len(delta), dtype=torch.float64)
+        placed = self._placed(target, torch.cat([delta + steps, delta - steps]))  # (2 n, O, 4, 4)
+        above, below = placed.chunk(2)
+        return ((above - below) / (2 * _STEP)).movedim(0, 1)
+
+
+def _twists(changes: Tensor, pose: Tensor, centre: Tensor) -> Tensor:
+    """Twists (6, n) about `centre` (3,) in the camera frame that belong to changes (n, 4, 4) of a pose (4, 4)."""
+    velocity = changes @ invert_rigid(pose)  # (n, 4, 4): of points in the camera frame
+    spin = velocity[:, :3, :3]
+    rotation = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]])
+    return torch.cat([rotation, (spin @ centre + velocity[:, :3, 3]).T])
+
+
 def image_costs(
     scene: Scene,
     poses: Poses,
@@ -66,26 +137,13 @@ def image_costs(
     render: Sequence[str],
     images: Sequence[tuple[Kind, int]],
     level: Level,
-) -> Callable[[Tensor], Tensor]:
-    """A function from deltas (P, Σ n_b) of the bodies to similarity costs (P, len(images)).
+) -> ImageCosts:
+    """Similarity costs of `images`, (kind, view) pairs, as functions of deltas (P, Σ n_b) of the bodies.
 
-    `images` are (kind, view) pairs. Objects of `render` that no body moves are drawn once and added.
+    Objects of `render` that no body moves are drawn once and added.
     """
-    targets = [_target(scene, poses, bodies, render, kind, view, level) for kind, view in images]
-
-    def costs(deltas: Tensor) -> Tensor:
-        motions = [body.motion(part) for body, part in zip(bodies, split(deltas, bodies), strict=True)]
-        columns = []
-        for target in targets:
-            placed = [_camera_from(name, target.view, poses, bodies, motions, len(deltas)) for name in target.moving]
-            drawn = target.background.expand(len(deltas), *target.camera.shape)
-            if placed:
-                volumes = [scene.volumes[name] for name in target.moving]
-                drawn = drawn + project(volumes, torch.stack(placed, 1), target.camera, level.step_mm)
-            columns.append(target.similarity(drawn))
-        return torch.stack(columns, 1)
-
-    return costs
+    targets = tuple(_target(scene, poses, bodies, render, kind, view, level) for kind, view in images)
+    return ImageCosts(scene.volumes, scene.reference_points, poses, bodies, level.step_mm, targets)
 
 
 def _camera_from(
@@ -102,19 +160,28 @@ def _camera_from(
     return camera @ in_camera1
 
 
-def stage_objective(costs: Callable[[Tensor], Tensor], bodies: tuple[Body, ...], prior: Prior | None) -> Objective:
+def stage_objective(costs: ImageCosts, bodies: tuple[Body, ...], prior: Prior | None) -> SmoothObjective:
     """Mean cost over the images, plus the prior's penalty on how far each body moves."""
+    stiffness = torch.cat([_stiffness(body, prior) for body in bodies])  # (Σ n_b,): the penalty is ½ Σ k δ²
 
-    def objective(deltas: Tensor) -> Tensor:
-        value = costs(deltas).mean(1)
-        if prior is None:
-            return value
-        per_radian = 180 / torch.pi / prior.rotation_deg
-        for body, part in zip(bodies, split(deltas, bodies), strict=True):
-            twist = part.new_zeros(len(part), 6)
-            twist[:, body.free] = part * body.scale[body.free]
-            size = (twist[:, :3] * per_radian).square().sum(1) + (twist[:, 3:] / prior.translation_mm).square().sum(1)
-            value = value + prior.weight * 0.5 * size
-        return value
+    def values(deltas: Tensor) -> Tensor:
+        return costs(deltas).mean(1) + 0.5 * (deltas.square() @ stiffness)
 
-    return objective
+    def quadratic(delta: Tensor) -> Quadratic:
+        parts = costs.quadratics(delta)
+        penalty = float(0.5 * (delta.square() @ stiffness))
+        return Quadratic(
+            sum(part.value for part in parts) / len(parts) + penalty,
+            torch.cat([*(part.scores / len(parts) for part in parts), (stiffness * delta)[None]]),
+            torch.stack([part.hessian for part in parts]).mean(0) + stiffness.diag(),
+        )
+
+    return SmoothObjective(values, quadratic)
+
+
+def _stiffness(body: Body, prior: Prior | None) -> Tensor:
+    """Second derivatives (n,) of the prior's penalty by the body's deltas."""
+    if prior is None:
+        return torch.zeros(len(body.free), dtype=torch.float64)
+    sigma = body.scale.new_tensor([prior.rotation_deg * torch.pi / 180] * 3 + [prior.translation_mm] * 3)
+    return prior.weight * (body.scale / sigma).square()[body.free]

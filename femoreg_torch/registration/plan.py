@@ -7,7 +7,7 @@ from jsonargparse import ArgumentError, ArgumentParser
 
 from femoreg_torch.configs import load_preset
 from femoreg_torch.errors import InputError
-from femoreg_torch.optimize import Bobyqa, CmaEs
+from femoreg_torch.optimize import Bobyqa, CmaEs, LevenbergMarquardt
 from femoreg_torch.registration.objective import Level, Prior
 
 ObjectName = Literal["pelvis", "femur", "device"]
@@ -15,13 +15,15 @@ ObjectName = Literal["pelvis", "femur", "device"]
 
 @dataclass(frozen=True)
 class BodyPlan:
-    """A body to move: `move` names objects that move together, or is [view] for the C-arm of the view at hand.
+    """A body to move: `move` names objects that move together, or the C-arm of a view.
 
-    `rotation_deg` and `translation_mm` are per axis of the camera (x along columns, y along rows, z depth): the initial
-    standard deviation for CMA-ES, the half-width of the box for BOBYQA. Zero freezes an axis.
+    [view] is the view at hand in a stage for each other view, [views] stands for one body per view but the first.
+    `rotation_deg` and `translation_mm` are per axis of the camera (x along columns, y along rows, z depth): the
+    standard deviation of random candidates for CMA-ES and Levenberg–Marquardt, the half-width of the box for BOBYQA.
+    Zero freezes an axis.
     """
 
-    move: list[ObjectName | Literal["view"]]
+    move: list[ObjectName | Literal["view", "views"]]
     centre: ObjectName
     rotation_deg: list[float]
     translation_mm: list[float]
@@ -37,7 +39,7 @@ class Stage:
     render: list[ObjectName]
     bodies: list[BodyPlan]
     level: Level
-    optimiser: CmaEs | Bobyqa
+    optimiser: CmaEs | Bobyqa | LevenbergMarquardt
     prior: Prior | None = None
 
 
@@ -62,10 +64,14 @@ class Plan:
 
 def load_plan(preset: str) -> Plan:
     """The workflow `configs/registration/<preset>.yaml`. Raises `InputError` that names preset, step and key."""
-    content = load_preset("registration", preset)
+    return plan_from(preset, load_preset("registration", preset))
+
+
+def plan_from(name: str, content: dict[str, Any]) -> Plan:
+    """The workflow of this name whose `steps` stand in `content`. Raises `InputError` that names it, step and key."""
     return Plan(
-        preset,
-        tuple(_step(step, f"registration preset {preset}, step {i + 1}") for i, step in enumerate(content["steps"])),
+        name,
+        tuple(_step(step, f"registration preset {name}, step {i + 1}") for i, step in enumerate(content["steps"])),
     )
 
 

@@ -1,8 +1,9 @@
 """Can a registration be trusted? Asked of every object in every view, without knowing the truth.
 
-Two signs of a wrong pose are measured at the solution. First, what the image gains when the object is drawn: a bone or
-a device that is not where it is drawn explains little of the image. Second, where each view by itself would move the
+Three signs of a wrong pose are measured at the solution. First, what the image gains when the object is drawn: a bone
+or a device that is not where it is drawn explains little of the image. Second, where each view by itself would move the
 object in its own image plane: views that pull in different directions contradict each other, or their common geometry.
+Third, the standard deviations of the pose (`registration.covariance`), depth included.
 """
 
 from collections.abc import Sequence
@@ -11,10 +12,11 @@ from dataclasses import dataclass
 import torch
 
 from femoreg_torch.geometry import invert_rigid
+from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
 from femoreg_torch.registration.objective import Level, image_costs
 from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, reference_point_in_view
 
-_LEVEL = Level(downsample=8, step_mm=1.0, patch_radius=5)
+_LEVEL = Level(downsample=8, step_mm=0.5, patch_radius=5)
 _PROBE_MM = 0.6  # about half a pixel of the level, at the object
 
 
@@ -24,6 +26,8 @@ class Limits:
 
     least_gain: float = 0.004  # of mean patch NCC, when the object is drawn
     most_pull_mm: float = 1.5  # of a single view in its image plane
+    most_deviation_mm: float = 1.0  # standard deviation along any axis
+    most_deviation_deg: float = 0.6  # and about any axis
 
 
 @dataclass(frozen=True)
@@ -42,22 +46,36 @@ class ObjectQuality:
 
     views: tuple[ViewQuality, ...]
     in_plane_uncertainty_mm: float  # root mean square disagreement of the views in their image planes
+    rotation_deviation_deg: tuple[float, ...]  # standard deviations about the axes of camera 1
+    translation_deviation_mm: tuple[float, ...]  # and along them, of the reference point
     trusted: bool
     reason: str
 
 
 def assess(scene: Scene, poses: Poses, limits: Limits) -> dict[str, ObjectQuality]:
     """Quality of every object placed in `poses`: bones in the anatomy images, the device in the device images."""
-    return {name: _assess_object(scene, poses, name, limits) for name in poses.camera1_from}
+    covariance = pose_covariance(scene, poses, _LEVEL)
+    return {name: _assess_object(scene, poses, name, covariance, limits) for name in poses.camera1_from}
 
 
-def _assess_object(scene: Scene, poses: Poses, name: str, limits: Limits) -> ObjectQuality:
+def _assess_object(scene: Scene, poses: Poses, name: str, covariance: PoseCovariance, limits: Limits) -> ObjectQuality:
     kind: Kind = "device" if name == "device" else "anatomy"
     views = tuple(_assess_view(scene, poses, name, kind, view) for view in range(len(scene.images[kind])))
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
-    reason = _reason(name, views, limits)
-    return ObjectQuality(views, uncertainty, reason is None, reason or "all views agree")
+    rotation, translation = covariance.deviations(name)
+    reason = _reason(name, views, limits) or _vague(name, rotation, translation, limits)
+    agreed = reason or "all views agree"
+    return ObjectQuality(views, uncertainty, tuple(rotation), tuple(translation), reason is None, agreed)
+
+
+def _vague(name: str, rotation: Sequence[float], translation: Sequence[float], limits: Limits) -> str | None:
+    """What the images leave open; nan counts as open."""
+    if not max(translation) <= limits.most_deviation_mm:
+        return f"the images fix the {name} to {max(translation):.1f} mm only (standard deviation along one axis)"
+    if not max(rotation) <= limits.most_deviation_deg:
+        return f"the images fix the {name} to {max(rotation):.1f}° only (standard deviation about one axis)"
+    return None
 
 
 def _reason(name: str, views: Sequence[ViewQuality], limits: Limits) -> str | None:

@@ -11,6 +11,7 @@ from torch import Tensor
 import femoreg_torch
 from femoreg_torch.case import Case
 from femoreg_torch.geometry import invert_rigid, transform_points
+from femoreg_torch.registration.moments import moments_content
 from femoreg_torch.registration.quality import ObjectQuality
 from femoreg_torch.registration.scene import Poses
 from femoreg_torch.registration.workflow import Outcome
@@ -54,6 +55,7 @@ def result_content(
                 "stop": entry.result.stop.value if entry.result else "all angles tried",
                 "camera_from_camera1": entry.poses.camera_from_camera1,
                 "camera1_from": entry.poses.camera1_from,
+                "moments": moments_content(entry.moments),
             }
             for entry in outcome.trace
         ],

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from femoreg_torch.case import Case
-from femoreg_torch.detect import load_network
-from femoreg_torch.registration.plan import load_plan
+from femoreg_torch.detect import detect, load_network
+from femoreg_torch.registration.plan import Plan, load_plan
 from femoreg_torch.registration.prepare import prepare_scene
 from femoreg_torch.registration.quality import Limits, assess
 from femoreg_torch.registration.report import result_content
-from femoreg_torch.registration.start import start_from_landmarks
+from femoreg_torch.registration.start import Detector, start_from_landmarks
 from femoreg_torch.registration.workflow import Report, run_plan
 
 
@@ -20,13 +20,19 @@ def register_case(case: Case, preset: str, seed: int, weights: Path | None, repo
     `weights` are those of the landmark network, None for those shipped. Raises `InputError` for input that does not
     fit.
     """
-    plan = load_plan(preset)
+    return register_by_plan(
+        case, load_plan(preset), seed, lambda image, camera: detect(load_network(weights), image, camera), report
+    )
+
+
+def register_by_plan(case: Case, plan: Plan, seed: int, find: Detector, report: Report) -> dict[str, Any]:
+    """The same by any plan, and from the landmarks that `find` sees in view 1."""
     clock = {"began": time.perf_counter()}
     report("reading CT and images", 0.0)
     scene = prepare_scene(case)
     clock["prepared"] = time.perf_counter()
     report("finding landmarks", 0.0)
-    camera1_from_pelvis, start = start_from_landmarks(case, scene, load_network(weights))
+    camera1_from_pelvis, start = start_from_landmarks(case, scene, find)
     clock["started"] = time.perf_counter()
     camera1_from_device = None if case.device is None else case.device.camera1_from_device
     outcome = run_plan(scene, plan, camera1_from_pelvis, camera1_from_device, seed, report)
@@ -40,4 +46,4 @@ def register_case(case: Case, preset: str, seed: int, weights: Path | None, repo
         "quality": done - clock["registered"],
         "total": done - clock["began"],
     }
-    return result_content(case, outcome, quality, start, timings, preset, seed)
+    return result_content(case, outcome, quality, start, timings, plan.preset, seed)

@@ -1,24 +1,28 @@
 """The start pose: landmarks that the network finds in view 1, and PnP (paper, section II-A)."""
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from femoreg_torch.case import Case
-from femoreg_torch.detect import Detection, detect
+from femoreg_torch.detect import Detection
 from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import Camera
 from femoreg_torch.pnp import PnpResult, solve_pnp
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.volume import HIP_LANDMARKS
 
+Detector = Callable[[Tensor, Camera], Detection]  # finds the landmarks in an attenuation image (H, W) of a camera
 
-def start_from_landmarks(case: Case, scene: Scene, network: nn.Module) -> tuple[Tensor, dict[str, Any]]:
-    """`camera1_from_pelvis` (4, 4) from the landmarks detected in view 1, and what is worth keeping of how it came.
+
+def start_from_landmarks(case: Case, scene: Scene, find: Detector) -> tuple[Tensor, dict[str, Any]]:
+    """`camera1_from_pelvis` (4, 4) from the landmarks that `find` sees in view 1, and what to keep of how it came.
 
     Raises `InputError` if fewer than four landmarks are of use.
     """
-    detection = detect(network, scene.images["anatomy"][0], scene.carm.camera)
+    detection = find(scene.images["anatomy"][0], scene.carm.camera)
     usable = [i for i, name in enumerate(HIP_LANDMARKS) if name in case.landmarks and bool(detection.visible[i])]
     if len(usable) < 4:
         raise InputError(

@@ -11,6 +11,7 @@ from femoreg_torch.drr import project
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import orbit_angles
 from femoreg_torch.optimize import Result, minimise
+from femoreg_torch.registration.moments import Moment, moments_of
 from femoreg_torch.registration.objective import image_costs, stage_objective
 from femoreg_torch.registration.plan import BodyPlan, OrbitSearch, Plan, Stage
 from femoreg_torch.registration.scene import (
@@ -38,6 +39,7 @@ class StepTrace:
     value: float
     evaluations: int
     seconds: float
+    moments: tuple[Moment, ...] = ()  # along the optimisation, for the replay
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +91,7 @@ def _run_step(scene: Scene, poses: Poses, step: Stage | OrbitSearch, seed: int) 
 def run_stage(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], seed: int) -> StepTrace:
     """Optimise the bodies of one stage over the given views."""
     began = time.perf_counter()
-    bodies = tuple(_body(scene, poses, plan, views[0]) for plan in stage.bodies)
+    bodies = tuple(body for plan in stage.bodies for body in _bodies(scene, poses, plan, views))
     images: list[tuple[Kind, int]] = [(kind, view) for kind in stage.kinds for view in views]
     costs = image_costs(scene, poses, bodies, stage.render, images, stage.level)
     objective = stage_objective(costs, bodies, stage.prior)
@@ -97,17 +99,18 @@ def run_stage(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], 
     view = views[0] if stage.images == "each other" else None
     seconds = time.perf_counter() - began
     after = moved(poses, bodies, result.delta)
-    return StepTrace(stage.name, view, after, result, result.value, result.evaluations, seconds)
+    moments = moments_of(result, lambda delta: moved(poses, bodies, delta))
+    return StepTrace(stage.name, view, after, result, result.value, result.evaluations, seconds, moments)
 
 
-def _body(scene: Scene, poses: Poses, plan: BodyPlan, view: int) -> Body:
+def _bodies(scene: Scene, poses: Poses, plan: BodyPlan, views: tuple[int, ...]) -> list[Body]:
+    """The bodies of one entry: objects, the C-arm of the view at hand, or those of all views but the first."""
     scale = torch.tensor([*plan.rotation_deg, *plan.translation_mm], dtype=torch.float64)
     scale[:3] *= torch.pi / 180
-    moves_view = "view" in plan.move
-    centre = reference_point_in_view(scene, poses, plan.centre, view if moves_view else 0)
-    if moves_view:
-        return Body((), view, centre, scale)
-    return Body(tuple(name for name in plan.move if name != "view"), 0, centre, scale)
+    moving = [view for view in views if view] if plan.move == ["views"] else views[:1] if plan.move == ["view"] else []
+    if moving:
+        return [Body((), view, reference_point_in_view(scene, poses, plan.centre, view), scale) for view in moving]
+    return [Body(tuple(plan.move), 0, reference_point_in_view(scene, poses, plan.centre, 0), scale)]
 
 
 def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> StepTrace:

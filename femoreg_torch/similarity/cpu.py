@@ -163,6 +163,16 @@ def _spread_back(store, moving, fixed, radius, share, out):  # type: ignore[no-u
 
 
 @_parallel
+def gradients(images, average, slope):  # type: ignore[no-untyped-def]
+    """Derivatives (B, 2, H, W) of images (B, H, W), along columns then along rows."""
+    count, height, width = images.shape
+    out = np.empty((count, 2, height, width), np.float32)
+    for i in nb.prange(count):
+        _gradients(images[i], average, slope, out[i])
+    return out
+
+
+@_parallel
 def grad_ncc(images, fixed, mean, scale, weights, radius, floor, average, slope):  # type: ignore[no-untyped-def]
     """Σ weight · NCC (B, 2) of the derivative maps of images (B, H, W) with the fixed ones (2, H, W)."""
     count, height, width = images.shape

@@ -11,7 +11,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.similarity import cpu
 from femoreg_torch.similarity.kernels import derivative_taps, image_gradients, patch_sums, patch_weights
 
-_FLAT = 1e-10  # sum of squared deviations below which a patch counts as flat: line integrals are of order 1
+FLAT = 1e-10  # sum of squared deviations below which a patch counts as flat: line integrals are of order 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class GradNcc:
         n = (2 * self.radius + 1) ** 2
         sums = patch_sums(moving, self.radius)
         spread = patch_sums(moving**2, self.radius) - sums**2 / n
-        flat = spread <= _FLAT
+        flat = spread <= FLAT
         root = torch.where(flat, torch.ones_like(spread), spread).sqrt()
         product = patch_sums(moving * self.fixed, self.radius) - sums * self.mean
         ncc = torch.where(flat, torch.zeros_like(product), product * self.scale / root)
@@ -68,7 +68,7 @@ def grad_ncc(fixed: Tensor, radius: int, smoothing_px: float = 1.1, weights: Ten
     n = (2 * radius + 1) ** 2
     mean = patch_sums(maps, radius) / n
     spread = patch_sums(maps**2, radius) - n * mean**2
-    scale = torch.where(spread > _FLAT, spread.clamp(min=_FLAT).rsqrt(), torch.zeros_like(spread))
+    scale = torch.where(spread > FLAT, spread.clamp(min=FLAT).rsqrt(), torch.zeros_like(spread))
     share = patch_weights(weights, (height, width), radius).to(mean.device)
     return GradNcc(maps, mean, scale, share, radius, taps)
 
@@ -80,7 +80,7 @@ class _CpuGradNcc(torch.autograd.Function):
     def _arguments(similarity: GradNcc) -> tuple[Any, ...]:
         average, slope = (taps.float().numpy() for taps in similarity.taps)
         numbers = (t.numpy() for t in (similarity.fixed, similarity.mean, similarity.scale, similarity.weights))
-        return *numbers, similarity.radius, _FLAT, average, slope
+        return *numbers, similarity.radius, FLAT, average, slope
 
     @staticmethod
     def forward(ctx: Any, images: Tensor, similarity: GradNcc) -> Tensor:

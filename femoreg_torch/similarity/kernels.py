@@ -6,6 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from femoreg_torch.similarity import cpu
+
 
 def derivative_taps(smoothing_px: float, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
     """Taps (K,) float64 across and along a derivative: Sobel's [1, 2, 1] / 4 and [−1, 0, 1] / 2, each smoothed.
@@ -30,8 +32,12 @@ def derivative_taps(smoothing_px: float, device: torch.device | None = None) -> 
 def image_gradients(images: Tensor, taps: tuple[Tensor, Tensor]) -> Tensor:
     """Derivatives (B, 2, H, W) per pixel, along columns then along rows, of images (B, H, W); edges are replicated.
 
-    `taps` are those of `derivative_taps`; kept on the images' device they need no copy per call.
+    `taps` are those of `derivative_taps`; kept on the images' device they need no copy per call. Compiled on the CPU in
+    float32 without gradients, else plain torch.
     """
+    if images.device.type == "cpu" and images.dtype == torch.float32 and not images.requires_grad:
+        averages, slopes = (t.float().numpy() for t in taps)
+        return torch.from_numpy(cpu.gradients(images.contiguous().numpy(), averages, slopes))
     average, slope = (t.to(images) for t in taps)
     reach = len(average) // 2
     padded = F.pad(images[:, None], (reach, reach, reach, reach), mode="replicate")

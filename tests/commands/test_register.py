@@ -164,3 +164,17 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 def test_an_unknown_preset_lists_the_known_ones(case: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["register", str(case), "--out", str(case.parent / "run"), "--preset", "quickest"]) == 2
     assert "there are: demo, paper" in capfd.readouterr().err
+
+
+def test_a_bad_calibration_of_the_robot_is_refused_before_the_work_begins(
+    case: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    robot, run = case.parent / "robot.txt", case.parent / "run"
+    robot.write_text("base_from_device\n1 0 0\n")
+    assert main(["register", str(case), "--out", str(run), "--robot", str(robot)]) == 2
+    assert "robot.txt, line 2: four numbers" in capfd.readouterr().err
+    robot.write_text("base_from_device\n1 0 0 900\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    change_yaml(case, lambda c: c.pop("device"))
+    assert main(["register", str(case), "--out", str(run), "--robot", str(robot)]) == 2
+    assert "no device to steer" in capfd.readouterr().err
+    assert not run.exists()

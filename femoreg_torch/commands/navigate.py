@@ -1,0 +1,38 @@
+"""`femoreg navigate RUN`: what a registration means for the robot."""
+
+from pathlib import Path
+
+
+def navigate(run: Path, *, robot: Path | None = None) -> None:
+    """Tell how far the guide is from the planned path, and write the motion of the device that corrects it.
+
+    Writes into RUN: navigation.json, and navigation/ with every transform as 4×4 text (.txt) and as an ITK transform
+    (.tfm) for 3D Slicer and SimpleITK. A matrix `b_from_a` takes points of frame a to frame b, in mm. A .tfm is in
+    ITK's direction: under it in 3D Slicer, a model of frame a appears in frame b. `femoreg register` writes the same
+    files; this command writes them anew, with the robot's calibration if it was not known then.
+
+    Args:
+        run: Folder that `femoreg register` wrote.
+        robot: Calibration of the robot at the moment of the device images, to have all in its base frame too. Text:
+            a line `base_from_device` and the four rows of the 4×4 matrix below it, in mm; or, so, both
+            `base_from_flange` (forward kinematics) and `flange_from_device` (hand-eye calibration). Or an ITK
+            transform named base_from_device.tfm, as 3D Slicer saves it.
+    """
+    from rich.console import Console
+
+    from femoreg_torch.case import new_folder, read_result
+    from femoreg_torch.errors import InputError
+    from femoreg_torch.navigation import NAVIGATION_NAME, navigation_content, read_robot, summary, write_navigation
+
+    calibration = None if robot is None else read_robot(robot)
+    result = read_result(run)
+    try:
+        content = navigation_content(result, calibration)
+    except InputError as error:
+        raise InputError(f"{run}: {error}") from error
+    with new_folder(run) as folder:
+        write_navigation(folder, content)
+    console = Console()
+    for line in summary(content):
+        console.print(line)
+    console.print(f"Written to {run / NAVIGATION_NAME} and {run / 'navigation'}")

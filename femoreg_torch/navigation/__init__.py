@@ -1,0 +1,18 @@
+"""What a registration means for the robot: where the guide is against the plan, and the motion that corrects it."""
+
+from femoreg_torch.navigation.guidance import Guidance, guide
+from femoreg_torch.navigation.report import NAVIGATION_NAME, navigation_content, summary
+from femoreg_torch.navigation.robot import Robot, read_robot
+from femoreg_torch.navigation.writing import clear_navigation, write_navigation
+
+__all__ = [
+    "NAVIGATION_NAME",
+    "Guidance",
+    "Robot",
+    "clear_navigation",
+    "guide",
+    "navigation_content",
+    "read_robot",
+    "summary",
+    "write_navigation",
+]

@@ -1,0 +1,83 @@
+"""Levenberg–Marquardt: steps of second order, damped until they improve; from one start or from the best of many."""
+
+from dataclasses import dataclass
+
+import torch
+
+from femoreg_torch.optimize.quadratic import Quadratic, SmoothObjective
+from femoreg_torch.optimize.result import BestSoFar, Result, Stop
+
+_DAMPING = 1e-3  # at the start, relative to the curvature of each degree of freedom
+_SOFTEST = 1e-4  # least curvature that counts, relative to the mean
+_LEAST_DAMPING = 1e-7
+_MOST_DAMPING = 1e4
+
+
+@dataclass(frozen=True)
+class LevenbergMarquardt:
+    """Settings of Levenberg–Marquardt with Nielsen's damping.
+
+    K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, DTU 2004, algorithm 3.16.
+    With `candidates`, so many random deltas of deviation one are looked at first, and the best `starts` of them and
+    zero are refined; the search ends with the best of these.
+    """
+
+    max_iterations: int = 20  # per start
+    tol_x: float = 1e-4  # length of a step, in units of the scales
+    tol_f: float = 1e-7  # improvement that a step promises
+    candidates: int = 0
+    starts: int = 1
+
+
+def minimise_levenberg_marquardt(objective: SmoothObjective, n: int, settings: LevenbergMarquardt, seed: int) -> Result:
+    """Minimise over deltas (n,), from zero and from random starts. Evaluations count quadratics and values alike."""
+    track = BestSoFar(objective)
+    starts = torch.zeros(1, n, dtype=torch.float64)
+    if settings.candidates:
+        generator = torch.Generator().manual_seed(seed)
+        drawn = torch.randn(settings.candidates, n, generator=generator, dtype=torch.float64)
+        tried = torch.cat([starts, drawn])
+        starts = tried[track(tried).argsort()[: settings.starts]]
+    best = None
+    for start in starts:
+        found = _descend(track, objective, start, settings)
+        if best is None or found[1] < best[1]:
+            best = found
+    assert best is not None  # there is always one start
+    return track.result(best[0])
+
+
+def _descend(
+    track: BestSoFar, objective: SmoothObjective, start: torch.Tensor, settings: LevenbergMarquardt
+) -> tuple[Stop, float]:
+    """Why a descent from one start stopped, and the value it came to."""
+    here, model = start, _quadratic(track, objective, start)
+    damping, growth = _DAMPING, 2.0
+    for _ in range(settings.max_iterations):
+        diagonal = model.hessian.diagonal()
+        # Marquardt's scaling: a stiff degree of freedom does not hold back a soft one, such as a small object's.
+        unit = diagonal.clamp(min=_SOFTEST * float(diagonal.mean()) + 1e-12)
+        damped = model.hessian + damping * unit.diag()
+        step = -torch.linalg.solve(damped, model.gradient)
+        promised = float(-(model.gradient @ step) - 0.5 * step @ model.hessian @ step)
+        if float(step.norm()) < settings.tol_x:
+            return Stop.SMALL_STEP, model.value
+        if promised < settings.tol_f:
+            return Stop.FLAT, model.value
+        trial = _quadratic(track, objective, here + step)
+        ratio = (model.value - trial.value) / promised
+        if ratio > 0:
+            here, model = here + step, trial
+            damping = max(_LEAST_DAMPING, damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3))
+            growth = 2.0
+        else:
+            damping, growth = damping * growth, growth * 2
+            if damping > _MOST_DAMPING:
+                return Stop.ROUNDOFF, model.value
+    return Stop.BUDGET, model.value
+
+
+def _quadratic(track: BestSoFar, objective: SmoothObjective, delta: torch.Tensor) -> Quadratic:
+    model = objective.quadratic(delta)
+    track.count(delta, model.value)
+    return model

@@ -1,0 +1,56 @@
+"""How well the images fix the poses: a covariance of all that was registered, from the derivatives at the end.
+
+The poses are where the scores of all image tiles cancel. Were the images drawn anew, the sum of the scores would vary
+by G = Σ s sᵀ, and the poses by H⁻¹ G H⁻¹ with the curvature H: the sandwich estimator with tiles as clusters (White,
+Maximum likelihood estimation of misspecified models, Econometrica 50 (1982) 1; Cameron and Miller, A practitioner's
+guide to cluster-robust inference, J. Human Resources 50 (2015) 317). It assumes neither a noise model nor independent
+pixels, only tiles that do not know of each other. What all tiles share (a wrong calibration, a wrong CT) it cannot see.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.registration.objective import Level, image_costs, stage_objective
+from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, reference_point_in_view
+
+_UNIT_DEG, _UNIT_MM = 1.0, 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class PoseCovariance:
+    """Covariance (6 B, 6 B) of the motions of B bodies: of every object in camera 1, and of the C-arm of other views.
+
+    A motion is a twist (degrees, mm) along the axes of its camera about the object's reference point, for a C-arm about
+    that of the pelvis.
+    """
+
+    bodies: tuple[str, ...]  # object names, then "view 2", …
+    matrix: Tensor
+
+    def of(self, first: str, second: str | None = None) -> Tensor:
+        """The block (6, 6) of one body, or of two."""
+        i, j = (6 * self.bodies.index(name) for name in (first, second or first))
+        return self.matrix[i : i + 6, j : j + 6]
+
+    def deviations(self, name: str) -> tuple[list[float], list[float]]:
+        """Standard deviations of one body: rotation (3) in degrees, translation (3) in mm."""
+        sigma = self.of(name).diagonal().sqrt().tolist()
+        return sigma[:3], sigma[3:]
+
+
+def pose_covariance(scene: Scene, poses: Poses, level: Level) -> PoseCovariance:
+    """The covariance of all poses at a solution, from the images of every view at one level."""
+    scale = torch.tensor([_UNIT_DEG * torch.pi / 180] * 3 + [_UNIT_MM] * 3, dtype=torch.float64)
+    objects = tuple(poses.camera1_from)
+    bodies = [Body((name,), 0, reference_point_in_view(scene, poses, name, 0), scale) for name in objects]
+    others = range(1, len(poses.camera_from_camera1))
+    bodies += [Body((), view, reference_point_in_view(scene, poses, "pelvis", view), scale) for view in others]
+    images: list[tuple[Kind, int]] = [(kind, view) for kind in scene.images for view in (0, *others)]
+    costs = image_costs(scene, poses, tuple(bodies), objects, images, level)
+    model = stage_objective(costs, tuple(bodies), None).quadratic(torch.zeros(6 * len(bodies), dtype=torch.float64))
+    inverse = torch.linalg.pinv(model.hessian, hermitian=True)
+    clusters = len(model.scores) / (len(model.scores) - 1)
+    matrix = clusters * inverse @ (model.scores.T @ model.scores) @ inverse
+    return PoseCovariance((*objects, *(f"view {view + 1}" for view in others)), matrix)

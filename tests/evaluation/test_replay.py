@@ -1,0 +1,164 @@
+"""The replay: its frames follow the trace, and the edges stand where the structures were at that moment."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from test_report import CAMERA, POSE, procedure  # noqa: F401
+
+from femoreg_torch.case import read_case, read_result, write_json
+from femoreg_torch.commands.main import main
+from femoreg_torch.evaluation.replay import frames_of
+from femoreg_torch.geometry import project_points, rigid, transform_points
+
+SHIFTS = (-60.0, -25.0, 0.0)  # mm along the columns: the pelvis, as it comes to its place
+EYE = torch.eye(4, dtype=torch.float64)
+
+
+def shifted(x: float) -> torch.Tensor:
+    return rigid(translation=torch.tensor([x, 0, 0], dtype=torch.float64)) @ POSE
+
+
+def stage(name: str, moments: list[dict[str, Any]], view: int | None = None, **placed: torch.Tensor) -> dict[str, Any]:
+    return {
+        "name": name,
+        "view": view,
+        "cost": 0.25,
+        "evaluations": 100,
+        "camera_from_camera1": EYE.expand(3, 4, 4),
+        "camera1_from": {"pelvis": POSE, "femur": POSE} | placed,
+        "moments": moments,
+    }
+
+
+@pytest.fixture
+def run(procedure: tuple[Path, Path]) -> Path:  # noqa: F811
+    """A run in which the pelvis comes from the side, then the C-arm of view 2 is found, then the device."""
+    folder, run = procedure
+    result = json.loads((run / "result.json").read_text(encoding="utf-8"))
+    nominal = read_case(folder).device.camera1_from_device  # type: ignore[union-attr]
+    start = {"pelvis": shifted(SHIFTS[0]), "femur": shifted(SHIFTS[0])}
+    coming = [{"evaluations": n, "cost": 0.5 - n / 100, "camera1_from": {"pelvis": shifted(x)}} for n, x in
+              enumerate(SHIFTS, 1)]  # fmt: skip
+    device = rigid(translation=torch.tensor([0.0, 0, 5], dtype=torch.float64)) @ nominal
+    result |= {
+        "case": "../case",
+        "start": {"camera1_from_pelvis": start["pelvis"]},
+        "trusted": False,
+        "stages": [
+            stage("pelvis in view 1", coming, device=nominal),
+            stage("orbit search", [], view=2, device=nominal),
+            stage("device", [{"evaluations": 1, "cost": 0.3, "camera1_from": {"device": nominal}}], device=device),
+        ],
+    }
+    write_json(run / "result.json", result)
+    return run
+
+
+def pictures(path: Path) -> list[NDArray[np.uint8]]:
+    with Image.open(path) as film:
+        found = []
+        for number in range(film.n_frames):  # type: ignore[attr-defined]
+            film.seek(number)
+            found.append(np.array(film.convert("RGB")))
+    return found
+
+
+def green(picture: NDArray[np.uint8], row: int, view: int) -> NDArray[np.bool_]:
+    """Pixels of an edge in one panel: row 0 is anatomy, 1 device."""
+    rows, columns = CAMERA.shape
+    panel = picture[22 + row * rows :, view * columns :][:rows, :columns].astype(int)
+    return (panel[..., 1] > 200) & (panel[..., 0] < 60) & (panel[..., 2] < 60)
+
+
+def test_frames_follow_the_trace(run: Path) -> None:
+    case = read_case(run.parent / "case")
+    frames = list(frames_of(read_result(run), case))
+    assert [frame.stage.partition(",")[0] for frame in frames] == [
+        "start: landmarks of the network",
+        *["1/3 pelvis in view 1"] * 4,
+        "2/3 orbit search",
+        *["3/3 device"] * 2,
+    ]
+    places = [float((frame.poses.camera1_from["pelvis"] - POSE)[0, 3]) for frame in frames[:5]]
+    assert places == pytest.approx([-60, *SHIFTS, 0])
+    assert [sorted(frame.views) for frame in frames] == [[0]] * 5 + [[0, 1]] * 3
+    assert ["device" in frame.objects for frame in frames] == [False] * 6 + [True] * 2
+    assert frames[2].detail == "2 evaluations, cost 0.4800"
+
+
+def test_edges_stand_where_the_pelvis_was_and_in_views_that_have_their_place(run: Path) -> None:
+    assert main(["replay", str(run)]) == 0
+    film = pictures(run / "replay.gif")
+    bar, (rows, columns) = 22, CAMERA.shape
+    assert film[0].shape == (2 * rows + 2 * bar, 3 * columns, 3)
+    start = green(film[0], 0, 0)[: rows - bar]  # the last rows hold text
+    corner = torch.tensor([[-45.0, 0, 0]], dtype=torch.float64)  # the face of the pelvis block towards the right
+    for frame, shift in ((film[0], SHIFTS[0]), (film[-1], SHIFTS[-1])):
+        left = project_points(CAMERA, transform_points(shifted(shift), corner))[0, 0].item()
+        found = np.nonzero(green(frame, 0, 0)[: rows - bar].any(0))[0].min()
+        assert abs(found - left) < 2 or (left < 0 and found < 2)
+    assert start.any()
+    assert not green(film[0], 0, 1).any()  # view 2 has no place yet
+    assert green(film[-1], 0, 1).any()
+    assert not green(film[-1], 0, 2).any()  # and view 3 never gets one here
+    assert not green(film[0], 1, 0).any()
+    assert green(film[-1], 1, 0).any()
+
+
+def test_the_end_says_that_the_result_is_not_trusted(run: Path) -> None:
+    assert main(["replay", str(run), "--out", str(run / "other.gif")]) == 0
+    film = pictures(run / "other.gif")
+    red = [(p[-22:, :, 0].astype(int) - p[-22:, :, 1] > 100).any() for p in film]
+    assert red[-1]
+    assert not any(red[:-1])
+
+
+def without_moments(run: Path) -> None:
+    result = json.loads((run / "result.json").read_text(encoding="utf-8"))
+    for entry in result["stages"]:
+        del entry["moments"]
+    write_json(run / "result.json", result)
+
+
+def two_views(run: Path) -> None:
+    result = json.loads((run / "result.json").read_text(encoding="utf-8"))
+    result["camera_from_pelvis"].pop()
+    write_json(run / "result.json", result)
+
+
+def case_moved(run: Path) -> None:
+    shutil.move(run.parent / "case", run.parent / "archive")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "arguments", "says"),
+    [
+        (without_moments, [], "Register again"),
+        (two_views, [], "2 views, but"),
+        (case_moved, [], "Name the case folder with --case"),
+        (lambda run: None, ["--out", "replay.mp4"], "ends in .gif"),
+    ],
+)
+def test_what_cannot_be_replayed_is_one_line(
+    spoil: Callable[[Path], None], arguments: list[str], says: str, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoil(run)
+    assert main(["replay", str(run), *arguments]) == 2
+    told = capsys.readouterr().err
+    assert says in told
+    assert told.count("\n") == 1
+    assert not (run / "replay.gif").exists()
+
+
+def test_a_case_that_was_moved_can_be_named(run: Path) -> None:
+    case_moved(run)
+    assert main(["replay", str(run), "--case", str(run.parent / "archive")]) == 0
+    assert (run / "replay.gif").is_file()

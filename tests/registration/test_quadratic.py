@@ -1,0 +1,55 @@
+"""Slope and curvature of a stage's objective, against finite differences of its values."""
+
+import math
+
+import torch
+from registration_scenes import REFERENCE_POINTS, float64, make_scene, off, true_poses
+
+from femoreg_torch.registration.objective import Level, Prior, image_costs, stage_objective
+from femoreg_torch.registration.scene import Body, reference_point_in_view
+
+_LEVEL = Level(downsample=1, step_mm=2.0, patch_radius=5)
+_SCALE = float64(*[math.radians(1)] * 3, 1.0, 1.0, 4.0)
+
+
+def _joint_objective(prior: Prior | None = None):  # type: ignore[no-untyped-def]
+    """Every object and every C-arm but the first free, a little off the truth."""
+    poses = true_poses()
+    scene = make_scene(poses)
+    for name, point in REFERENCE_POINTS.items():
+        poses = poses.with_object(name, off(poses.camera1_from[name], point, (0.5, -0.4, 0.6), (0.5, 0.4, -2)))
+    objects = tuple(
+        Body((name,), 0, reference_point_in_view(scene, poses, name, 0), _SCALE) for name in REFERENCE_POINTS
+    )
+    views = tuple(Body((), v, reference_point_in_view(scene, poses, "pelvis", v), _SCALE) for v in (1, 2))
+    images = [(kind, view) for kind in ("anatomy", "device") for view in range(3)]
+    costs = image_costs(scene, poses, (*objects, *views), tuple(REFERENCE_POINTS), images, _LEVEL)
+    return stage_objective(costs, (*objects, *views), prior)
+
+
+def test_the_gradient_is_the_slope_of_the_values_and_the_curvature_is_never_negative() -> None:
+    objective = _joint_objective(Prior(rotation_deg=5, translation_mm=10, weight=0.1))
+    delta = 0.3 * torch.randn(30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    model = objective.quadratic(delta)
+    h = 0.02
+    moved = delta + h * torch.cat([torch.eye(30), -torch.eye(30)]).double()
+    values = objective(moved)
+    slope = (values[:30] - values[30:]) / (2 * h)
+    assert abs(model.value - float(objective(delta[None])[0])) < 1e-7
+    assert (model.gradient - slope).norm() < 0.03 * slope.norm()
+    assert torch.linalg.eigvalsh(model.hessian).min() > 0
+
+
+def test_at_the_solution_the_curvature_is_that_of_the_values() -> None:
+    """Depth is left out: its part of the second derivative that no first derivative tells is as large as the rest."""
+    poses = true_poses()
+    scene = make_scene(poses)
+    body = Body(("pelvis", "femur"), 0, reference_point_in_view(scene, poses, "pelvis", 0), _SCALE)
+    costs = image_costs(scene, poses, (body,), ("pelvis", "femur"), [("anatomy", 0)], _LEVEL)
+    objective = stage_objective(costs, (body,), None)
+    hessian = objective.quadratic(torch.zeros(6, dtype=torch.float64)).hessian
+    for axis in range(5):
+        step = torch.zeros(3, 6, dtype=torch.float64)
+        step[0, axis], step[2, axis] = -0.6, 0.6
+        below, here, above = objective(step).tolist()
+        assert abs((below + above - 2 * here) / 0.6**2 / float(hessian[axis, axis]) - 1) < 0.25, axis
