@@ -7,7 +7,7 @@ def register(
     case: Path,
     *,
     out: Path,
-    preset: str = "demo",
+    preset: str = "fast",
     seed: int = 0,
     weights: Path | None = None,
     robot: Path | None = None,
@@ -22,8 +22,8 @@ def register(
     Args:
         case: Case folder with case.yaml.
         out: Folder to write the result to.
-        preset: Workflow in configs/registration: `demo` (coarse and quick) or `paper` (images and
-            optimisers of the paper, minutes).
+        preset: Workflow in configs/registration: `fast` (derivatives of the images, everything refined together),
+            `paper` (images and optimisers of the paper, minutes) or `derivative_free` (as `paper`, but coarse).
         seed: Of the random searches; the same seed gives the same result.
         weights: Weights of the landmark network, if not those shipped (safetensors).
         robot: Calibration of the robot, to have the motion in its base frame too: see `femoreg navigate --help`.

@@ -75,13 +75,13 @@ def line_integrals(poses: Poses, view: int, names: tuple[str, ...]) -> Tensor:
     return torch.nn.functional.avg_pool2d(total[None, None], 4)[0, 0]
 
 
-def make_scene(poses: Poses, seed: int = 0, with_device: bool = True) -> Scene:
+def make_scene(poses: Poses, seed: int = 0, with_device: bool = True, noise: float = 0.003) -> Scene:
     """Noisy images of all views with all objects at `poses`."""
     generator = torch.Generator().manual_seed(seed)
 
     def image(view: int, names: tuple[str, ...]) -> Tensor:
         exact = line_integrals(poses, view, names)
-        return exact + 0.003 * torch.randn(exact.shape, generator=generator)
+        return exact + noise * torch.randn(exact.shape, generator=generator)
 
     views = range(len(poses.camera_from_camera1))
     images: dict[Kind, tuple[Tensor, ...]] = {"anatomy": tuple(image(v, ("pelvis", "femur")) for v in views)}
