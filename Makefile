@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test lint bench bench-gpu
+.PHONY: setup demo test lint bench bench-gpu accuracy capture-range ablation
 
 setup: .venv/.installed
 
@@ -30,3 +30,22 @@ bench: setup
 bench-gpu: setup
 	$(BIN)/python benchmarks/drr.py --device cuda
 	$(BIN)/python benchmarks/scaling.py --device cuda
+
+# Studies on simulated procedures; they renew docs/accuracy.md. Made once, the procedures stay in out/accuracy. The real bone
+# shapes are looked for in the folder FEMOREG_DATA.
+PRESET ?= fast
+JOBS ?= 1
+TIMED ?= 5
+
+.venv/.study: .venv/.installed
+	$(BIN)/python -m pip install --quiet --editable '.[dev,study]' --constraint constraints.txt
+	touch $@
+
+accuracy: .venv/.study
+	$(BIN)/python -m sim.study accuracy --preset $(PRESET) --jobs $(JOBS) --timed $(TIMED) --docs docs
+
+capture-range: .venv/.study
+	$(BIN)/python -m sim.study capture-range --preset $(PRESET) --docs docs
+
+ablation: .venv/.study
+	$(BIN)/python -m sim.study ablation --jobs $(JOBS) --docs docs

@@ -9,7 +9,7 @@ pixels, like the dustbin of SuperPoint (DeTone et al., CVPRW 2018).
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -20,8 +20,10 @@ from torch.nn import functional as F
 class UNetConfig:
     """Everything that fixes the network's shape."""
 
+    architecture: Literal["compact", "grupp2020"] = "compact"  # this module's, or `models.reference`
     channels: tuple[int, ...] = (64, 96, 160, 256)  # per level, at 1/4, 1/8, 1/16, 1/32 of the input
     convolutions: tuple[int, ...] = (2, 2, 3, 3)  # per level of the encoder
+    residual: tuple[int, ...] = ()  # residual blocks after those, per level; none by default
     patch: int = 4  # pixels per side that become channels
     classes: int = 7  # background, hip bones left and right, vertebrae, sacrum, femora left and right
     landmarks: int = 14
@@ -41,9 +43,27 @@ def _convolution(inputs: int, outputs: int) -> nn.Sequential:
     )
 
 
-def _level(inputs: int, outputs: int, convolutions: int) -> nn.Sequential:
+class _Residual(nn.Module):
+    """Two convolutions beside a shortcut, as in He et al., ECCV 2016.
+
+    The last scale starts at zero, so that a network may be deepened without changing what it has learned.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        last = nn.BatchNorm2d(width)
+        nn.init.zeros_(last.weight)
+        self.body = nn.Sequential(_convolution(width, width), nn.Conv2d(width, width, 3, padding=1, bias=False), last)
+
+    def forward(self, features: Tensor) -> Tensor:
+        return F.relu(features + self.body(features))
+
+
+def _level(inputs: int, outputs: int, convolutions: int, residual: int) -> nn.Sequential:
     return nn.Sequential(
-        _convolution(inputs, outputs), *(_convolution(outputs, outputs) for _ in range(convolutions - 1))
+        _convolution(inputs, outputs),
+        *(_convolution(outputs, outputs) for _ in range(convolutions - 1)),
+        *(_Residual(outputs) for _ in range(residual)),
     )
 
 
@@ -55,7 +75,9 @@ class UNet(nn.Module):
         self.config = config
         widths = config.channels
         inputs = (config.patch**2, *widths[:-1])
-        self.encoder = nn.ModuleList(_level(*sizes) for sizes in zip(inputs, widths, config.convolutions, strict=True))
+        blocks = config.residual or (0,) * len(widths)
+        sizes = zip(inputs, widths, config.convolutions, blocks, strict=True)
+        self.encoder = nn.ModuleList(_level(*size) for size in sizes)
         self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1, bias=False) for a, b in pairwise(widths))
         self.decoder = nn.ModuleList(_convolution(2 * a, a) for a in widths[:-1])
         zoom = (config.patch // 2) ** 2

@@ -9,18 +9,20 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
+from models.build import make_network
+from models.reference import ReferenceUNet
 from models.unet import UNet, UNetConfig
 
 SHIPPED_WEIGHTS = "hip14.safetensors"
 
 
-def save_weights(path: Path, network: UNet, about: dict[str, str]) -> None:
+def save_weights(path: Path, network: UNet | ReferenceUNet, about: dict[str, str]) -> None:
     """Write the weights, the `UNetConfig` and the texts `about` (how they came to be)."""
     state = {name: tensor.detach().contiguous() for name, tensor in network.state_dict().items()}
     save_file(state, path, metadata={"config": json.dumps(asdict(network.config)), **about})
 
 
-def load_weights(path: Path | None = None) -> UNet:
+def load_weights(path: Path | None = None) -> UNet | ReferenceUNet:
     """The network of a weights file in evaluation mode; without a path, the shipped one.
 
     Raises `FileNotFoundError` if there is no such file and `ValueError` if it holds something else.
@@ -39,9 +41,9 @@ def load_weights(path: Path | None = None) -> UNet:
     if "config" not in metadata:
         raise ValueError(f"{path}: its metadata has no `config`, so these are no weights of this network.")
     try:
-        network = UNet(_config(json.loads(metadata["config"])))
+        network = make_network(_config(json.loads(metadata["config"])))
         network.load_state_dict(state)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: weights and `config` do not fit this network ({error}).") from error
     return network.eval()
 

@@ -6,24 +6,20 @@ stands in front of the patient, so x is the patient's left, y is down and z is t
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, TypeVar
 
 import torch
 import trimesh
-import yaml
-from femoreg_torch.configs import load_preset
 from torch import Tensor
 from torch.nn import functional as F
 
 from femoreg_torch.case import Case, Truth
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import CArm, about_point, exp_so3, invert_rigid, project_points, rigid, transform_points
+from sim.settings import read_settings, record, section
 from sim.xray import XrayModel
 
 _AP_ROTATION = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)  # camera from LPS
 _TRIES = 200
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -69,35 +65,16 @@ class Procedure:
 
 def load_settings(config: str) -> tuple[Acquisition, XrayModel]:
     """Settings from a preset (`configs/simulation/`) or from a YAML file. Raises `InputError` that names the key."""
-    if config.endswith((".yaml", ".yml")):
-        if not Path(config).is_file():
-            raise InputError(f"{config}: no such file. Give a YAML file or a preset such as `paper`.")
-        settings = yaml.safe_load(Path(config).read_text(encoding="utf-8"))
-    else:
-        settings = load_preset("simulation", config)
+    settings = read_settings(config)
     where = f"simulation settings {config}"
-    acquisition = dict(_section(settings, "acquisition", where))
+    acquisition = dict(section(settings, "acquisition", where))
     for name in ("view", "pelvis", "femur", "device"):
-        acquisition[name] = _record(Motion, _section(acquisition, name, f"{where}, acquisition"), f"{where}, {name}")
+        acquisition[name] = record(Motion, section(acquisition, name, f"{where}, acquisition"), f"{where}, {name}")
     acquisition["orbit_deg"] = tuple((float(mean), float(std)) for mean, std in acquisition.get("orbit_deg", ()))
     return (
-        _record(Acquisition, acquisition, f"{where}, acquisition"),
-        _record(XrayModel, _section(settings, "xray", where), f"{where}, xray"),
+        record(Acquisition, acquisition, f"{where}, acquisition"),
+        record(XrayModel, section(settings, "xray", where), f"{where}, xray"),
     )
-
-
-def _section(settings: Any, name: str, where: str) -> dict[str, Any]:
-    if not isinstance(settings, dict) or not isinstance(settings.get(name), dict):
-        raise InputError(f"{where}: the section `{name}` is missing. See configs/simulation/paper.yaml.")
-    return settings[name]
-
-
-def _record(kind: type[_T], values: dict[str, Any], where: str) -> _T:
-    known = set(kind.__dataclass_fields__)  # type: ignore[attr-defined]
-    for problem, keys in (("unknown key", set(values) - known), ("missing key", known - set(values))):
-        if keys:
-            raise InputError(f"{where}: {problem} `{min(keys)}`. Known keys: {', '.join(sorted(known))}.")
-    return kind(**values)
 
 
 def nominal_ap(head_centre: Tensor, side: str, settings: Acquisition) -> Tensor:

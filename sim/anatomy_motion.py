@@ -1,4 +1,4 @@
-"""The hip between CT and operation: one femur turned about the centre of its head, in the CT itself.
+"""The hip between CT and operation: one femur turned about the centre of its head, in the volume itself.
 
 The volume is taken apart into soft tissue (with the bones filled in), the moving femur and the bones at rest. The soft
 tissue is bent smoothly around the femur, then the bones are laid over it again with soft edges: the femur rigidly
@@ -19,7 +19,7 @@ from torch import Tensor
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume import Volume
 
-_RIM_MM = 1.2  # width of the blur that grows a label by its partial-volume rim
+RIM_MM = 1.2  # width of the blur that grows a label by its partial-volume rim
 _FALL_OFF_MM = 30.0  # distance from the femur over which the soft tissue comes to rest
 _MARGIN_MM = _FALL_OFF_MM + 2.0
 _COARSE_MM = 2.0  # grid of the smooth fields: fill of the bones, bend of the soft tissue
@@ -39,7 +39,7 @@ class _Box:
 
 
 def rotate_femur(ct: Volume, labels: Volume, femur: tuple[int, ...], rotation: Tensor, head_centre: Tensor) -> Volume:
-    """The CT (HU) after the femur has turned about its head centre by `rotation`, with the tissue around it.
+    """A CT (HU or densities) after the femur has turned about its head centre by `rotation`, with the tissue around it.
 
     `labels` lies on the grid of `ct`, 0 where there is no bone; `femur` holds the labels of the femur that moves.
     `rotation` (3, 3) acts in LPS; `head_centre` (3,) in LPS mm. Voxels of other bones keep their values exactly. Raises
@@ -55,7 +55,7 @@ def rotate_femur(ct: Volume, labels: Volume, femur: tuple[int, ...], rotation: T
     moving = is_femur[box.slices]
     resting = (label_array[box.slices] > 0) & ~moving
 
-    femur_alpha, rest_alpha = _soft_masks(moving, resting, box.spacing_zyx)
+    femur_alpha, rest_alpha = soft_masks(moving, resting, box.spacing_zyx)
     matrix, offset = _index_turn(box, turn, centre)
     moved_alpha = ndimage.affine_transform(femur_alpha, matrix, offset, order=1, mode="nearest")
     moved_femur = ndimage.affine_transform(before, matrix, offset, order=3, mode="nearest")
@@ -99,11 +99,13 @@ def _index_turn(box: _Box, turn: Matrix, centre: Matrix) -> tuple[Matrix, Matrix
     return back[::-1, ::-1], (middle - back @ middle)[::-1]
 
 
-def _soft_masks(moving: Mask, resting: Mask, spacing_zyx: Matrix) -> tuple[Array, Array]:
-    """Opacities in [0, 1] of the moving and the resting bones: 1 on label and rim; rims go to the nearer bone."""
+def soft_masks(moving: Mask, resting: Mask, spacing_zyx: Matrix) -> tuple[Array, Array]:
+    """Opacities in [0, 1] of the moving and the resting bones: 1 on label and rim; rims go to the nearer bone.
+
+    The masks are [z, y, x], as is `spacing_zyx` in mm.
+    """
     near_moving, near_resting = (
-        ndimage.gaussian_filter(mask.astype(np.float32), _RIM_MM / spacing_zyx, truncate=3)
-        for mask in (moving, resting)
+        ndimage.gaussian_filter(mask.astype(np.float32), RIM_MM / spacing_zyx, truncate=3) for mask in (moving, resting)
     )
 
     def opacity(mask: Mask, own: Array, foreign: Array) -> Array:

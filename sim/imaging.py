@@ -1,20 +1,24 @@
 """The six images of one procedure: every view without and with the device."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import trimesh
 from torch import Tensor
+from torch.nn import functional as F
 
+from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, invert_rigid, transform_points
 from femoreg_torch.volume import Volume, crop, hu_to_attenuation, voxelise_mesh
 from sim.acquisition import Acquisition, Procedure
-from sim.anatomy_motion import rotate_femur
-from sim.materials import metal_density
-from sim.xray import XrayModel, areal_densities, fluoroscopy, tissue_volumes
+from sim.materials import WATER_PER_BONE, metal_density
+from sim.posed_tissue import PosedTissue, take_apart
+from sim.xray import XrayModel, areal_densities, fluoroscopy
 
 _ROOM_MM = 45.0  # kept around the field of view, because the femur's turn brings tissue in from outside
+_PIXEL_PER_VOXEL = 0.6  # mm on the detector; a voxel's shadow there is some 1.35 times as wide as the voxel
+_ASIDE = 2  # coarse pixels to each side that cubic interpolation needs
 
 
 @dataclass(frozen=True)
@@ -46,17 +50,61 @@ def simulate_images(
     poses = procedure.truth.camera_from_pelvis
     report("turning the femur")
     ct, labels = (field_of_view(volume, poses, camera, _ROOM_MM) for volume in (ct, labels))
-    ct = field_of_view(rotate_femur(ct, labels, femur, procedure.femur_rotation, head_centre), poses, camera, 0)
-    soft, bone = tissue_volumes(ct)
+    tissue = take_apart(ct, labels, femur, procedure.femur_rotation, head_centre)
+    del ct, labels
     metal = device_density(mesh, settings.step_mm, settings.device_hu)
     views = []
     for number, (pose, device_pose) in enumerate(zip(poses, procedure.camera_from_device, strict=True), 1):
         report(f"imaging view {number} of {len(poses)}")
-        tissue = areal_densities({"water": soft, "bone": bone}, pose, camera, settings.step_mm)
+        body = tissue_shadow(tissue, pose, camera, settings.step_mm)
         device = areal_densities({"titanium": metal}, device_pose, camera, settings.step_mm)
-        anatomy_image = fluoroscopy(tissue, camera, model, generator)
-        views.append(ViewImages(anatomy_image, fluoroscopy(tissue | device, camera, model, generator)))
+        anatomy_image = fluoroscopy(body, camera, model, generator)
+        views.append(ViewImages(anatomy_image, fluoroscopy(body | device, camera, model, generator)))
     return views
+
+
+def tissue_shadow(tissue: PosedTissue, camera_from_lps: Tensor, camera: Camera, step_mm: float) -> dict[str, Tensor]:
+    """Mass per area (H, W) in g/cm² of `water` and `bone` behind a patient."""
+    poses = torch.stack([camera_from_lps, camera_from_lps @ tissue.lps_from_femur])
+    return shadow(tissue.filled, camera_from_lps, [tissue.bone, tissue.femur], poses, camera, step_mm)
+
+
+def shadow(
+    filled: Volume,
+    camera_from_filled: Tensor,
+    bones: Sequence[Volume],
+    camera_from_bone: Tensor,
+    camera: Camera,
+    step_mm: float,
+) -> dict[str, Tensor]:
+    """Mass per area (H, W) in g/cm² of `water` and `bone` behind densities of `sim.posed_tissue`.
+
+    `camera_from_filled` is (4, 4), `camera_from_bone` (V, 4, 4).
+    """
+    bone = _interpolated(bones, camera_from_bone, camera, step_mm)
+    body = _interpolated([filled], camera_from_filled[None], camera, max(step_mm, min(filled.spacing_mm)))
+    return {"water": body - WATER_PER_BONE * bone, "bone": bone}
+
+
+def _interpolated(volumes: Sequence[Volume], camera_from_volume: Tensor, camera: Camera, step_mm: float) -> Tensor:
+    """Mass per area (H, W) in g/cm² of densities in g/cm³; poses (V, 4, 4).
+
+    Where a voxel's shadow is several pixels wide, every few pixels are rendered, about two to a voxel, and the others
+    interpolated by cubic convolution (Keys, IEEE Trans Acoust Speech Signal Process 29 (1981) 1153). The coarse image
+    reaches beyond the detector by as much as that looks aside.
+    """
+    voxel_mm = min(min(volume.spacing_mm) for volume in volumes)
+    factor = max(1, round(_PIXEL_PER_VOXEL * voxel_mm / max(camera.pixel_mm)))
+    if factor == 1:
+        return project(volumes, camera_from_volume[None], camera, step_mm)[0] / 10  # mm · g/cm³ to g/cm²
+    aside = _ASIDE * factor
+    rows, columns = (-(-n // factor) * factor + 2 * aside for n in camera.shape)
+    column, row = camera.principal_point_px
+    wide = replace(camera, shape=(rows, columns), principal_point_px=(column + aside, row + aside))
+    image = project(volumes, camera_from_volume[None], wide.downsampled(factor), step_mm)[None] / 10
+    # only with `antialias` are the kernels those of Keys; there is nothing to smooth where pixels become smaller
+    fine = F.interpolate(image, size=wide.shape, mode="bicubic", antialias=True)[0, 0]
+    return fine[aside : aside + camera.shape[0], aside : aside + camera.shape[1]].contiguous()
 
 
 def device_density(mesh: trimesh.Trimesh, spacing_mm: float, hu: float) -> Volume:

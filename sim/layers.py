@@ -1,6 +1,6 @@
 """A CT taken apart into what can be moved and weighted one by one: soft tissue and the attenuation of each bone."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ BONE_IDS = (1, 2, 3, 4, 5, 6)  # hip bones left and right, vertebrae, sacrum, fe
 _SOFT_HU = 50.0  # bone is the attenuation above this one
 _TISSUE_MM = 3.0
 _RIM_MM = 2.0  # partial-volume rim of a bone outside its label
+_FIELD_STEP = 4  # voxels between the points where a displacement is computed; linear between them
 _BEYOND = 30  # tissue voxels repeated above and below the scan, so that the patient does not end in mid-air
 
 Displacement = Callable[[Tensor], Tensor]  # points (..., 3) in LPS mm to shifts (..., 3) in mm
@@ -87,27 +88,30 @@ def deform(layers: Layers, displacement: Displacement) -> Layers:
     landmarks = layers.landmarks
     for _ in range(50):  # fixed point of p = p_old − displacement(p); contracts, as the field is smooth
         landmarks = layers.landmarks - displacement(landmarks)
-    return Layers(
-        _warped(layers.tissue, displacement),
-        {label: _warped(_padded(bone, (8, 8, 8)), displacement) for label, bone in layers.bones.items()},
-        {label: _warped(_padded(mask, (8, 8, 8)), displacement) for label, mask in layers.masks.items()},
-        landmarks,
-    )
+    tissue = _warped([layers.tissue], displacement)[0]
+    bones, masks = {}, {}
+    for label, bone in layers.bones.items():
+        pair = [_padded(volume, (8, 8, 8)) for volume in (bone, layers.masks[label])]
+        bones[label], masks[label] = _warped(pair, displacement)
+    return Layers(tissue, bones, masks, landmarks)
 
 
-def _warped(volume: Volume, displacement: Displacement) -> Volume:
-    """The volume pulled back through the field, on its own grid."""
-    depth, height, width = volume.data.shape
-    z, y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in (depth, height, width)), indexing="ij")
-    affine = volume.lps_from_index.float()
-    points = torch.stack([x, y, z], -1) @ affine[:3, :3].T + affine[:3, 3]
-    source = points + displacement(points)
-    index_from_lps = torch.linalg.inv(affine)
-    index = source @ index_from_lps[:3, :3].T + index_from_lps[:3, 3]
-    size = torch.tensor([width, height, depth], dtype=torch.float32)
-    unit = (2 * index + 1) / size - 1  # voxel centres at integers to grid_sample's −1 … 1 with align_corners=False
-    data = F.grid_sample(volume.data[None, None], unit[None], align_corners=False)[0, 0]
-    return volume.with_data(data)
+def _warped(volumes: Sequence[Volume], displacement: Displacement) -> list[Volume]:
+    """Volumes of one grid pulled back through the field, on that grid."""
+    affine = volumes[0].lps_from_index.float()
+    size = torch.tensor(volumes[0].data.shape).flip(0)
+    coarse = [_FIELD_STEP * torch.arange(-(-(int(n) - 1) // _FIELD_STEP) + 1, dtype=torch.float32) for n in size]
+    z, y, x = torch.meshgrid(coarse[2], coarse[1], coarse[0], indexing="ij")
+    index = torch.stack([x, y, z], -1)
+    points = index @ affine[:3, :3].T + affine[:3, 3]
+    source = index + displacement(points) @ torch.linalg.inv(affine[:3, :3]).T
+    unit = (2 * source + 1) / size - 1  # voxel centres at integers to grid_sample's −1 … 1 with align_corners=False
+    fine = [_FIELD_STEP * (len(axis) - 1) + 1 for axis in reversed(coarse)]
+    unit = F.interpolate(unit.movedim(-1, 0)[None], fine, mode="trilinear", align_corners=True)[0]
+    depth, height, width = volumes[0].data.shape
+    unit = unit[:, :depth, :height, :width].movedim(0, -1)
+    data = F.grid_sample(torch.stack([volume.data for volume in volumes])[None], unit[None], align_corners=False)[0]
+    return [volume.with_data(moved) for volume, moved in zip(volumes, data, strict=True)]
 
 
 def _padded(volume: Volume, margin_xyz: tuple[int, int, int], mode: str = "constant") -> Volume:

@@ -1,7 +1,7 @@
 """What X-rays meet: mass attenuation coefficients, densities from Hounsfield units, and the spectrum of the tube.
 
 Coefficients: Hubbell and Seltzer, Tables of X-ray mass attenuation coefficients, NIST Standard Reference Database 126
-(water, cortical bone of ICRU-44, titanium, aluminium), interpolated log–log as the tables ask for.
+(water, cortical bone of ICRU-44, titanium, aluminium, dry air), interpolated log–log as the tables ask for.
 """
 
 import torch
@@ -15,10 +15,18 @@ _MASS_ATTENUATION = {  # total, with coherent scattering, cm²/g
     "bone": (9.032, 4.001, 1.331, 0.6655, 0.4242, 0.3148, 0.2229, 0.1855),
     "titanium": (35.87, 15.85, 4.972, 2.214, 1.213, 0.7661, 0.4052, 0.2721),
     "aluminium": (7.955, 3.441, 1.128, 0.5685, 0.3681, 0.2778, 0.2018, 0.1704),
+    "air, absorbed": (1.334, 0.5389, 0.1537, 0.06833, 0.04098, 0.03041, 0.02407, 0.02325),  # μ_en/ρ: energy absorption
 }
 _BONE_DENSITY = 1.92  # g/cm³, cortical bone, ICRU Report 44
 _ALUMINIUM_DENSITY = 2.699  # g/cm³
+_K_EDGE_KEV = 69.525  # tungsten
+_K_LINES = ((59.318, 100.0), (57.982, 58.0), (67.244, 22.0), (69.067, 8.0))  # keV and relative intensity: X-ray Data
+# Booklet, Lawrence Berkeley National Laboratory, LBNL/PUB-490 (2009), table 1-3
+_KEV_PER_G_IN_UGY = 6.2415e6  # 1 Gy is 1 J/kg, 1 J is 6.2415e15 keV
 _SOFT_HU, _BONE_HU = 50.0, 1500.0  # muscle; the HU at which the density relation below gives cortical bone
+_TOTAL_PER_HU = 0.0005886  # g/cm³, above water; see `tissue_densities`
+# Between muscle and cortical bone each g of bone takes the place of so many g of soft tissue.
+WATER_PER_BONE = 1 - _TOTAL_PER_HU * (_BONE_HU - _SOFT_HU) / _BONE_DENSITY
 _REFERENCE_KEV = 60.0  # about the effective energy of a CT at 120 kVp
 
 
@@ -42,7 +50,7 @@ def tissue_densities(hu: Tensor) -> tuple[Tensor, Tensor]:
     et al., MICCAI 2018, after Schneider et al., Phys Med Biol 45 (2000) 459). Between muscle and cortical bone a voxel
     is a mixture by volume, so the split is linear in HU and a voxel at the rim of a bone is neither one nor the other.
     """
-    total = torch.minimum(1.03 + 0.001029 * hu, 1.03 + 0.0005886 * hu).clamp_min(0)
+    total = torch.minimum(1.03 + 0.001029 * hu, 1.03 + _TOTAL_PER_HU * hu).clamp_min(0)
     share = ((hu - _SOFT_HU) / (_BONE_HU - _SOFT_HU)).clamp_min(0)
     bone = torch.minimum(share * _BONE_DENSITY, total)
     return total - bone, bone
@@ -55,16 +63,32 @@ def metal_density(hu: float) -> float:
     return (1 + hu / 1000) * water / titanium
 
 
-def tungsten_spectrum(kvp: float, aluminium_mm: float, bins: int) -> tuple[Tensor, Tensor]:
-    """Energies in keV and the share of photons (sum 1) in equal bins from 15 keV up to the tube voltage.
+def tungsten_spectrum(kvp: float, aluminium_mm: float, bins: int, k_lines: float) -> tuple[Tensor, Tensor]:
+    """Energies in keV and the share of photons (sum 1): equal bins from 15 keV up to the tube voltage, then K lines.
 
-    Thick-target bremsstrahlung by Kramers' law, N(E) ∝ (E₀ − E) / E (Kramers, Phil Mag 46 (1923) 836), behind an
-    aluminium filter. Characteristic lines are left out: below 80 kVp they carry a few per cent of the energy.
+    Thick-target bremsstrahlung by Kramers' law, N(E) ∝ (E₀ − E) / E (Kramers, Phil Mag 46 (1923) 836), and above the K
+    edge of tungsten its characteristic lines, whose photons grow as (E₀ / E_K − 1)^1.63 (Green and Cosslett, Proc Phys
+    Soc 78 (1961) 1206); at twice the edge there are `k_lines` of them per photon of bremsstrahlung above 15 keV. All
+    behind an aluminium filter.
     """
     if not _ENERGIES_KEV[0] < kvp <= _ENERGIES_KEV[-1]:
         raise InputError(f"kvp: a tube voltage between 15 and 100 kV was expected, got {kvp:g}.")
     width = (kvp - _ENERGIES_KEV[0]) / bins
     energies = _ENERGIES_KEV[0] + width * (torch.arange(bins, dtype=torch.float64) + 0.5)
-    filtered = torch.exp(-mass_attenuation("aluminium", energies) * _ALUMINIUM_DENSITY * aluminium_mm / 10)
-    photons = (kvp - energies) / energies * filtered
+    photons = (kvp - energies) / energies
+    if kvp > _K_EDGE_KEV and k_lines > 0:
+        lines, intensity = torch.tensor(_K_LINES, dtype=torch.float64).T
+        excited = k_lines * (kvp / _K_EDGE_KEV - 1) ** 1.63 * photons.sum()
+        energies = torch.cat([energies, lines])
+        photons = torch.cat([photons, excited * intensity / intensity.sum()])
+    photons = photons * torch.exp(-mass_attenuation("aluminium", energies) * _ALUMINIUM_DENSITY * aluminium_mm / 10)
     return energies, photons / photons.sum()
+
+
+def fluence(kerma_ugy: float, energies_kev: Tensor, photons: Tensor) -> float:
+    """Photons per cm² of a spectrum (shares `photons`, sum 1) whose air kerma is `kerma_ugy`.
+
+    K = Φ Σ share · E · μ_en/ρ (Attix, Introduction to Radiological Physics and Radiation Dosimetry, 1986, chapter 2).
+    """
+    per_photon = (photons * energies_kev * mass_attenuation("air, absorbed", energies_kev)).sum().item()
+    return kerma_ugy * _KEV_PER_G_IN_UGY / per_photon

@@ -21,12 +21,14 @@ _PA_FROM_LPS = torch.tensor([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]], dtype=torch.
 class ViewRanges:
     """Half-ranges of the draws; angles in degrees, lengths in mm."""
 
-    orbital_deg: float = 45.0  # about the patient's long axis, triangular: views near AP are the common ones
-    cranio_caudal_deg: float = 20.0
+    orbital_deg: float = 60.0  # about the patient's long axis, triangular: views near AP are the common ones
+    cranio_caudal_deg: float = 30.0  # triangular as well
     in_plane_deg: float = 15.0
-    depth_mm: tuple[float, float] = (650.0, 850.0)  # source to the middle of the femoral heads
+    depth_mm: tuple[float, float] = (580.0, 880.0)  # source to the middle of the femoral heads
     shift_mm: float = 45.0  # across and along, in the plane of the femoral heads
     one_hip_share: float = 0.5  # views aimed at one hip instead of the middle of the pelvis
+    cranial_share: float = 0.25  # views moved up the patient, so that the lumbar spine is in the image
+    cranial_mm: tuple[float, float] = (30.0, 100.0)  # by so much, instead of the shift along
     posterior_share: float = 0.3  # views with the source behind the patient
     hip_rotation_deg: tuple[float, float, float] = (20.0, 12.0, 25.0)  # flexion, abduction, internal rotation
     size: float = 0.10  # change of all lengths
@@ -69,7 +71,7 @@ def sample_pose(ranges: ViewRanges, landmarks: Tensor, rng: np.random.Generator)
     stretch = _stretch(ranges, middle, rng)
     angles = np.array(
         [
-            rng.uniform(-ranges.cranio_caudal_deg, ranges.cranio_caudal_deg),
+            rng.triangular(-ranges.cranio_caudal_deg, 0, ranges.cranio_caudal_deg),
             rng.triangular(-ranges.orbital_deg, 0, ranges.orbital_deg),
             rng.uniform(-ranges.in_plane_deg, ranges.in_plane_deg),
         ]
@@ -81,6 +83,8 @@ def sample_pose(ranges: ViewRanges, landmarks: Tensor, rng: np.random.Generator)
         head = heads[rng.integers(2)]
         aim = head + rng.uniform(0, 0.6) * (middle - head)
     target = np.append(rng.uniform(-ranges.shift_mm, ranges.shift_mm, 2), rng.uniform(*ranges.depth_mm))
+    if rng.random() < ranges.cranial_share:
+        target[1] = rng.uniform(*ranges.cranial_mm)  # image rows run to the feet
     camera_from_lps = rigid(rotation, torch.from_numpy(target) - rotation @ aim) @ stretch
     return LabelledPose(camera_from_lps, _turned_femora(ranges, landmarks, camera_from_lps, rng), mirrored)
 

@@ -6,6 +6,7 @@ Beer-Lambert, scatter as a blurred share of the primary beam, Poisson noise, det
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -25,16 +26,19 @@ class AugmentationSettings:
     """Ranges of the uniform draws, and shares of the images that something happens to."""
 
     tissue: tuple[float, float] = (0.4, 0.9)  # factor of soft tissue's attenuation
-    bone: tuple[float, float] = (0.5, 1.5)  # factor of bone's attenuation above soft tissue: density
+    bone: tuple[float, float] = (0.6, 1.6)  # factor of bone's attenuation above soft tissue: density
     bone_spread: float = 0.2  # and of each bone by itself
-    unevenness: float = 0.5  # peak of a smooth random field added to the attenuation
+    unevenness: float = 0.4  # scale of a smooth random field added to the attenuation
+    gas: float = 0.15  # and of a finer one, as of gas and folds of soft tissue
+    edge_share: float = 0.15  # table edges and covers: a straight step of attenuation
     instrument_share: float = 0.35
+    vignetting: float = 0.4  # greatest loss of signal in the corners
     scatter: tuple[float, float] = (0.0, 0.6)  # relative to the mean of the primary beam
-    photons: tuple[float, float] = (100.0, 20000.0)  # per pixel of the network's grid at the mean; log-uniform
+    photons: tuple[float, float] = (200.0, 20000.0)  # per pixel of the network's grid at the mean; log-uniform
     blur_px: tuple[float, float] = (0.01, 1.2)
     saturation_share: float = 0.3
     gamma: tuple[float, float] = (0.6, 1.7)
-    inverted_share: float = 0.03
+    inverted_share: float = 0.05
     collimated_share: float = 0.25
     erased_share: float = 0.2
     rotation_deg: float = 12.0
@@ -69,11 +73,25 @@ def compose(tissue: Tensor, bones: Tensor, settings: AugmentationSettings, gener
     count = len(tissue)
     soft = F.interpolate(tissue.float()[:, None], scale_factor=2, mode="bilinear")[:, 0]
     spread = _uniform(1 - settings.bone_spread, 1 + settings.bone_spread, (count, 6, 1, 1), generator)
-    density = _uniform(*settings.bone, (count, 1, 1), generator)
-    field = F.interpolate(torch.randn((count, 1, 4, 4), generator=generator), soft.shape[1:], mode="bicubic")[:, 0]
-    unevenness = _uniform(0, settings.unevenness, (count, 1, 1), generator) * field
-    bone = (bones.float() * spread).sum(1) * density
+    weights = (_uniform(*settings.bone, (count, 1, 1, 1), generator) * spread).view(count, 1, 6)
+    bone = (weights @ bones.float().flatten(2)).view(soft.shape)
+    unevenness = _smooth_field(count, 4, soft.shape[1:], generator) * settings.unevenness
+    unevenness += _smooth_field(count, 14, soft.shape[1:], generator) * settings.gas
     return soft * _uniform(*settings.tissue, (count, 1, 1), generator) + bone + unevenness
+
+
+def _smooth_field(count: int, knots: int, shape: torch.Size, generator: Generator) -> Tensor:
+    """Fields (B, H, W) through normal deviates at `knots` × `knots` places, each image's scaled by its own 0 … 1."""
+    values = torch.randn((count, knots, knots), generator=generator) * torch.rand((count, 1, 1), generator=generator)
+    # The interpolation is separable, and this small: two products with its matrix beat an image operation by far.
+    rows, columns = (_interpolation(knots, size) for size in shape)
+    return rows @ values @ columns.mT
+
+
+@cache
+def _interpolation(knots: int, size: int) -> Tensor:
+    """Matrix (size, knots) of the bicubic interpolation from knots to pixels."""
+    return F.interpolate(torch.eye(knots)[None, None], (size, knots), mode="bicubic", align_corners=True)[0, 0]
 
 
 def flip_sides(images: Tensor, labels: Tensor, landmarks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -119,40 +137,59 @@ def move(images: Tensor, labels: Tensor, landmarks: Tensor, affine: Tensor) -> t
 
 
 def add_instruments(attenuation: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:
-    """Up to three straight metal rods in some of the images (B, H, W)."""
+    """Up to two straight metal rods and a plate in some of the images (B, H, W), and the edge of a table in others."""
     count, height, width = attenuation.shape
     row, column = torch.meshgrid(torch.arange(height).float(), torch.arange(width).float(), indexing="ij")
     chosen = _chosen(settings.instrument_share, count, generator)
-    for _ in range(3):
+    for number in range(3):
         there = chosen & _chosen(0.6, count, generator)
-        start, end = (_uniform(-0.2 * width, 1.2 * width, (count, 2, 1, 1), generator) for _ in range(2))
-        along = end - start
-        from_start = torch.stack([column, row]) - start
-        share = ((from_start * along).sum(1) / (along**2).sum(1)).clamp(0, 1)[:, None]
-        distance = ((from_start - share * along) ** 2).sum(1).sqrt()
-        radius = _log_uniform(0.8, 12.0, (count, 1, 1), generator)
-        depth = _log_uniform(0.2, 4.0, (count, 1, 1), generator)
-        # chord of a round rod, with half a pixel of blur at its rim
-        chord = ((radius + 0.5 - distance).clamp_min(0) / (radius + 0.5)).sqrt()
-        attenuation = attenuation + there * depth * chord
-    return attenuation
+        middle = _uniform(-0.1 * width, 1.1 * width, (count, 2, 1, 1), generator)
+        angle = _uniform(0, math.pi, (count, 1, 1), generator)
+        x, y = column - middle[:, 0], row - middle[:, 1]
+        along, across = (x * angle.cos() + y * angle.sin()).abs(), (y * angle.cos() - x * angle.sin()).abs()
+        half_length = _log_uniform(20, 0.8 * width, (count, 1, 1), generator)
+        depth = _log_uniform(0.2, 4.0, (count, 1, 1), generator) * there
+        ends = (half_length + 0.5 - along).clamp(0, 1)
+        if number < 2:
+            radius = _log_uniform(0.8, 12.0, (count, 1, 1), generator)
+            # chord of a round rod, with half a pixel of blur at its rim
+            profile = ((radius + 0.5 - across).clamp_min(0) / (radius + 0.5)).sqrt()
+        else:
+            profile = (_log_uniform(3, 40, (count, 1, 1), generator) + 0.5 - across).clamp(0, 1)
+        attenuation = attenuation + depth * ends * profile
+    angle = _uniform(0, 2 * math.pi, (count, 1, 1), generator)
+    distance = (column - width / 2) * angle.cos() + (row - height / 2) * angle.sin()
+    step = _chosen(settings.edge_share, count, generator) * _uniform(0.05, 0.5, (count, 1, 1), generator)
+    return attenuation + step * (distance - _uniform(-0.4, 0.4, (count, 1, 1), generator) * width).clamp(0, 1)
 
 
 def expose(attenuation: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:
-    """Attenuation (B, H, W) as a detector would show it: scatter, noise, blur, saturation."""
+    """Attenuation (B, H, W) as a detector would show it: scatter, vignetting, noise, blur, saturation.
+
+    The number of photons is drawn from the normal distribution of the same mean and variance as Poisson's.
+    """
     count = len(attenuation)
     primary = torch.exp(-attenuation.clamp_min(0))
     primary = primary / primary.mean((1, 2), keepdim=True)
     coarse = F.avg_pool2d(primary[:, None], 8)
     spread = F.interpolate(gaussian_blur2d(coarse, (7, 7), (3.0, 3.0)), primary.shape[1:], mode="bilinear")[:, 0]
     beam = primary + _uniform(*settings.scatter, (count, 1, 1), generator) * spread
+    beam = beam * (1 - _uniform(0, settings.vignetting, (count, 1, 1), generator) * _corners(beam.shape[1:]))
     photons = _log_uniform(*settings.photons, (count, 1, 1), generator)
-    signal = torch.poisson(beam * photons, generator=generator)[:, None]
+    noise = torch.randn(beam.shape, generator=generator) * (beam / photons).sqrt()
     sigma = _uniform(*settings.blur_px, (count, 1), generator).expand(count, 2)
-    signal = gaussian_blur2d(signal, (7, 7), sigma)[:, 0] / photons
-    ceiling = torch.quantile(signal.flatten(1), 0.5, dim=1)[:, None, None] * _uniform(1.5, 6, (count, 1, 1), generator)
+    signal = gaussian_blur2d((beam + noise).clamp_min(0)[:, None], (7, 7), sigma)[:, 0]
+    middling = signal[:, ::4, ::4].flatten(1).median(1).values[:, None, None]
+    ceiling = middling * _uniform(1.5, 6, (count, 1, 1), generator)
     signal = torch.where(_chosen(settings.saturation_share, count, generator), signal.minimum(ceiling), signal)
-    return -torch.log(signal.clamp_min(0.3 / photons))
+    return -torch.log(torch.maximum(signal, 0.3 / photons))
+
+
+@cache
+def _corners(shape: torch.Size) -> Tensor:
+    """Squared distance (H, W) from the middle, 1 in the corners."""
+    rows, columns = (torch.linspace(-1, 1, size) ** 2 for size in shape)
+    return (rows[:, None] + columns) / 2
 
 
 def alter_contrast(images: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:

@@ -55,7 +55,7 @@ def render_cohort(
     validation: list[Path] = []
     for seed in settings.validation_seeds:
         make = partial(_make_patient, seed, settings.patient_spacing_mm)
-        validation += _variants(settings, cache, f"patient{seed}", 1, make, report)
+        validation += _variants(settings, cache, f"patient{seed}", settings.patient_variants, make, report)
     return training, validation
 
 

@@ -1,6 +1,7 @@
-"""The command `femoreg train`."""
+"""The commands `femoreg train` and `femoreg measure`."""
 
 from pathlib import Path
+from typing import Literal
 
 
 def train(
@@ -12,6 +13,9 @@ def train(
     override: list[str] | None = None,
     start: Path | None = None,
     resume: bool = False,
+    accelerator: Literal["cpu", "cuda", "auto"] = "cpu",
+    devices: int = 1,
+    nodes: int = 1,
 ) -> None:
     """Train the landmark and segmentation network and export its weights.
 
@@ -27,8 +31,37 @@ def train(
         override: settings as group.key=value, for instance '[optimisation.epochs=3, cohort.views=10]'.
         start: weights (safetensors) to begin with instead of random ones.
         resume: continue from the last checkpoint in OUT.
+        accelerator: cpu, cuda, or whichever is there.
+        devices: how many of them per node; a step then takes a batch on each.
+        nodes: how many machines; start the command on each, as Lightning's documentation says for your cluster.
     """
-    from training.run import train_network
+    from training.run import Machine, train_network
     from training.settings import read_settings
 
-    train_network(read_settings(settings, override or []), cases or [], out, cache or out / "cache", start, resume)
+    machine = Machine(accelerator, devices, nodes)
+    train_network(
+        read_settings(settings, override or []), cases or [], out, cache or out / "cache", start, resume, machine
+    )
+
+
+def measure(images: list[Path], *, out: Path, weights: Path | None = None) -> None:
+    """Measure the landmark network and its start poses on labelled images.
+
+    Writes into OUT: accuracy.json and accuracy.md, with intervals by bootstrap over patients.
+
+    Args:
+        images: files of labelled images (safetensors), one per patient.
+        out: folder of the results.
+        weights: network weights (safetensors); by default the shipped ones.
+    """
+    from rich.console import Console
+
+    from femoreg_torch.detect import load_network
+    from training.accuracy_table import accuracy_page, write_accuracy
+    from training.measure import images_of_file, read_images, summarise
+
+    network = load_network(weights)
+    readings = [reading for path in images for reading in read_images(network, images_of_file(path))]
+    accuracy = summarise(readings)
+    write_accuracy(out, accuracy)
+    Console().print(accuracy_page(accuracy), highlight=False)

@@ -42,16 +42,16 @@ class ViewBatches(Dataset[Batch]):
 
 
 class _Consecutive(Sampler[int]):
-    """Batch numbers of one epoch, so that no two epochs see the same batch."""
+    """Batch numbers of one epoch, so that no two epochs see the same batch, dealt out among `world` processes."""
 
-    def __init__(self, epoch: int, length: int) -> None:
-        self.epoch, self.length = epoch, length
+    def __init__(self, epoch: int, length: int, rank: int, world: int) -> None:
+        self.numbers = range(epoch * length, (epoch + 1) * length)[rank : length - length % world : world]
 
     def __len__(self) -> int:
-        return self.length
+        return len(self.numbers)
 
     def __iter__(self) -> Iterator[int]:
-        return iter(range(self.epoch * self.length, (self.epoch + 1) * self.length))
+        return iter(self.numbers)
 
 
 class ViewData(LightningDataModule):
@@ -74,13 +74,12 @@ class ViewData(LightningDataModule):
         self.validation = ViewBatches(validation, batch_size, settings, seed + 1, validation_batches)
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        epoch = self.trainer.current_epoch if self.trainer else 0
-        return DataLoader(
-            self.training,
-            batch_size=None,
-            sampler=_Consecutive(epoch, self.batches_per_epoch),
-            num_workers=self.workers,
-        )
+        if self.trainer is None:
+            rank, world, epoch = 0, 1, 0
+        else:
+            rank, world, epoch = self.trainer.global_rank, self.trainer.world_size, self.trainer.current_epoch
+        sampler = _Consecutive(epoch, self.batches_per_epoch, rank, world)
+        return DataLoader(self.training, batch_size=None, sampler=sampler, num_workers=self.workers)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         return DataLoader(self.validation, batch_size=None, num_workers=self.workers)

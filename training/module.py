@@ -8,8 +8,9 @@ from lightning import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
+from models.build import make_network
 from models.losses import landmark_log_probabilities, multi_task_loss
-from models.unet import Prediction, UNet, UNetConfig
+from models.unet import Prediction, UNetConfig
 from training.augmentation import Batch
 
 
@@ -27,6 +28,7 @@ class OptimisationSettings:
     sigma_px: float = 1.5  # of the heat-map target on the network's output grid (3.1 mm pixels)
     landmark_weight: float = 0.5
     averaging: float = 0.998  # decay of the moving average of the weights that is validated and exported
+    patience: int = 0  # epochs without a better validation loss before training stops early; 0: never
 
 
 def landmark_errors_px(prediction: Prediction, landmarks: Tensor, visible: Tensor) -> Tensor:
@@ -38,11 +40,11 @@ def landmark_errors_px(prediction: Prediction, landmarks: Tensor, visible: Tenso
 
 
 class HipTraining(LightningModule):
-    """Trains a `UNet` on `Batch`es; logs losses, landmark errors, visibility and overlap."""
+    """Trains a network on `Batch`es; logs losses, landmark errors, visibility and overlap."""
 
     def __init__(self, network: UNetConfig, settings: OptimisationSettings) -> None:
         super().__init__()
-        self.network = UNet(network).to(memory_format=torch.channels_last)
+        self.network = make_network(network).to(memory_format=torch.channels_last)
         self.settings = settings
 
     def _losses(self, batch: Batch) -> tuple[Prediction, dict[str, Tensor]]:
@@ -62,7 +64,7 @@ class HipTraining(LightningModule):
         self.log_dict({f"train/{name}": value for name, value in losses.items()}, batch_size=len(batch.images))
         return losses["loss"]
 
-    def validation_step(self, batch: Batch, _number: int) -> None:
+    def validation_step(self, batch: Batch, _number: int) -> dict[str, Tensor]:
         prediction, losses = self._losses(batch)
         absent = landmark_log_probabilities(prediction.heatmaps, prediction.absence)[..., -1].exp()
         correct = ((absent < 0.5) == batch.visible).float().mean()
@@ -75,7 +77,8 @@ class HipTraining(LightningModule):
             "validation/visibility": correct,
             "validation/pixel_accuracy": overlap,
         }
-        self.log_dict(values, batch_size=len(batch.images), prog_bar=True)
+        self.log_dict(values, batch_size=len(batch.images), prog_bar=True, sync_dist=True)
+        return prediction._asdict()
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         s = self.settings
@@ -85,7 +88,8 @@ class HipTraining(LightningModule):
 
     def _rate(self, step: int) -> float:
         """Linear warm-up, then half a cosine down to one per cent, relative to the learning rate."""
-        done = step / (self.settings.epochs * self.settings.batches_per_epoch)
+        steps = self.settings.epochs * (self.settings.batches_per_epoch // self.trainer.world_size)
+        done = step / max(1, steps)
         warm_up = self.settings.warm_up
         if done < warm_up:
             return max(done, 1e-6) / warm_up

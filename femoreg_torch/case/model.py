@@ -17,12 +17,16 @@ DEVICE_POINTS = ("tip", "base", "center")
 
 @dataclass(frozen=True)
 class Device:
-    """A drilling or injection device. Points (3,) are mm in the frame of its CAD model."""
+    """A drilling or injection device: a closed mesh, a labelled volume, or (where `hu` is None) a volume in HU.
+
+    Points (3,) are mm in the device's own space: the mesh's coordinates, or the volume's LPS.
+    """
 
     model_path: Path
-    hu: float
+    hu: float | None  # of its material
     points: dict[str, Tensor]  # tip, base (guide axis: base → tip) and center (where errors are reported)
     camera1_from_device: Tensor  # (4, 4), nominal start pose
+    labels: tuple[int, ...] | None = None  # of its voxels in a labelled volume
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from femoreg_torch.geometry import CArm, carm_from_dict, load_carm
 from femoreg_torch.volume import LANDMARK_STEMS, read_landmarks
 
 VERSION = 1
+VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")  # of a device's volume
 
 
 def read_case(folder: Path) -> Case:
@@ -66,14 +67,20 @@ def _structures(ct: Fields, side: Side) -> dict[str, tuple[int, ...]]:
     for name in ("pelvis", f"femur_{side}"):
         structures.value(name, "a list of label ids")
     found: dict[str, tuple[int, ...]] = {}
-    for name, ids in structures.content.items():
-        if not isinstance(ids, list) or not ids or not all(type(n) is int and 0 < n < 256 for n in ids):
-            raise InputError(f"{structures.where(name)}: a list of label ids (1 to 255) was expected, found {ids!r}.")
+    for name in structures.content:
+        ids = _label_ids(structures, name)
         for other, taken in found.items():
             if shared := set(ids) & set(taken):
                 raise InputError(f"{structures.where(name)}: label {min(shared)} belongs to {other} already.")
-        found[name] = tuple(ids)
+        found[name] = ids
     return found
+
+
+def _label_ids(fields: Fields, key: str) -> tuple[int, ...]:
+    ids = fields.value(key, "a list of label ids")
+    if not isinstance(ids, list) or not ids or not all(type(n) is int and 0 < n < 256 for n in ids):
+        raise InputError(f"{fields.where(key)}: a list of label ids (1 to 255) was expected, found {ids!r}.")
+    return tuple(ids)
 
 
 def _target(plan: Fields, landmarks: dict[str, Tensor], side: Side) -> Tensor:
@@ -92,14 +99,40 @@ def _target(plan: Fields, landmarks: dict[str, Tensor], side: Side) -> Tensor:
 
 
 def _device(device: Fields, folder: Path) -> Device:
-    device.only("model", "hu", "points", "camera1_from_device")
+    device.only("model", "volume", "labels", "hu", "points", "camera1_from_device")
     points = device.mapping("points").only(*DEVICE_POINTS)
     found = {name: points.point(name) for name in DEVICE_POINTS}
     if torch.equal(found["tip"], found["base"]):
         raise InputError(f"{points.where('tip')}: tip and base are the same point, so the guide has no direction.")
-    return Device(
-        device.file_path("model", folder), device.number("hu"), found, device.transform("camera1_from_device")
-    )
+    path, labels = _device_model(device, folder)
+    hu = device.number("hu") if "model" in device or labels else None
+    return Device(path, hu, found, device.transform("camera1_from_device"), labels)
+
+
+def _device_model(device: Fields, folder: Path) -> tuple[Path, tuple[int, ...] | None]:
+    """The device's mesh or volume, and the labels of its voxels if it is a labelled volume."""
+    if "model" in device and "volume" in device:
+        raise InputError(f"{device.where('volume')}: `model` (a mesh) is given too. Keep one of the two.")
+    if "volume" not in device:
+        if "labels" in device:
+            raise InputError(f"{device.where('labels')}: only a `volume` has labels, found `model` (a mesh).")
+        path = device.file_path("model", folder)
+        if path.name.lower().endswith(VOLUME_SUFFIXES):
+            raise InputError(f"{device.where('model')}: a mesh was expected, found {path.name}. Give it as `volume`.")
+        return path, None
+    path = device.file_path("volume", folder)
+    if not path.name.lower().endswith(VOLUME_SUFFIXES):
+        raise InputError(
+            f"{device.where('volume')}: a volume ({', '.join(VOLUME_SUFFIXES)}) was expected, found {path.name}. "
+            "Give a mesh as `model`."
+        )
+    if "labels" in device:
+        return path, _label_ids(device, "labels")
+    if "hu" in device:
+        raise InputError(
+            f"{device.where('hu')}: a `volume` without `labels` holds HU itself. Name the labels, or drop `hu`."
+        )
+    return path, None
 
 
 def _carm(top: Fields) -> CArm:

@@ -57,9 +57,14 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 def _device(device: Device, folder: Path) -> dict[str, Any]:
-    return {
-        "model": _relative(device.model_path, folder),
-        "hu": device.hu,
+    content: dict[str, Any] = {}
+    is_volume = device.labels is not None or device.hu is None
+    content["volume" if is_volume else "model"] = _relative(device.model_path, folder)
+    if device.labels is not None:
+        content["labels"] = list(device.labels)
+    if device.hu is not None:
+        content["hu"] = device.hu
+    return content | {
         "points": device.points,
         "camera1_from_device": device.camera1_from_device,
     }

@@ -16,10 +16,11 @@ def detect(
 
     Writes into OUT: landmarks.csv with the columns image, landmark, column_px, row_px, confidence, visible; and for
     each image a picture, and its visible landmarks as 3D Slicer markups (x = column, y = row, as for pixels of 1 mm).
-    Patient left is expected on the right; an image that stands on its head is noticed.
+    Patient left is expected on the right; an image that stands on its head, or has bone and background exchanged, is
+    noticed. So is one with fewer than four landmarks, which no start pose can be made of.
 
     Args:
-        images: fluoroscopic images: DICOM, PNG, TIFF, NIfTI, MHA or NRRD.
+        images: fluoroscopic images, or folders of nothing else: DICOM, PNG, TIFF, NIfTI, MHA or NRRD.
         out: folder of the results.
         carm: C-arm preset that the images come from.
         intensity: raw (bone dark) or log (attenuation, bone bright).
@@ -33,7 +34,9 @@ def detect(
     from femoreg_torch.errors import InputError
     from femoreg_torch.fluoro import attenuation_image, check_matches, read_image
     from femoreg_torch.geometry import load_carm
+    from femoreg_torch.pnp import MINIMUM
 
+    images = [file for path in images for file in _files(path)]
     repeated = {path.stem for path in images if sum(path.stem == other.stem for other in images) > 1}
     if repeated:
         raise InputError(f"images: the name {min(repeated)} stands there twice. Rename one, results go by this name.")
@@ -47,5 +50,22 @@ def detect(
     write_detections(out, images, attenuation, detections, camera)
     console = Console()
     for path, detection in zip(images, detections, strict=True):
-        turned = ", standing on its head" if detection.turned else ""
-        console.print(f"{path}: {int(detection.visible.sum())} of {len(detection.visible)} landmarks{turned}")
+        found = int(detection.visible.sum())
+        remarks = [
+            *(["standing on its head"] if detection.turned else []),
+            *(["grey values inverted"] if detection.inverted else []),
+            *([f"not enough landmarks for a start pose, which takes {MINIMUM}"] if found < MINIMUM else []),
+        ]
+        console.print(", ".join([f"{path}: {found} of {len(detection.visible)} landmarks", *remarks]))
+
+
+def _files(path: Path) -> list[Path]:
+    """The file itself, or all files of a folder. Raises `InputError` for a folder without any."""
+    from femoreg_torch.errors import InputError
+
+    if not path.is_dir():
+        return [path]
+    files = sorted(entry for entry in path.iterdir() if entry.is_file() and not entry.name.startswith("."))
+    if not files:
+        raise InputError(f"{path}: a folder without files. Name images, or a folder of images.")
+    return files

@@ -6,13 +6,15 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from femoreg_torch.detect.decode import decode_heatmaps
+from femoreg_torch.detect.decode import decode_heatmaps, expected_error
 from femoreg_torch.detect.grid import image_from_network, network_camera, to_network_grid
+from femoreg_torch.detect.looks import LOOKS, PLAIN, Look, read_image
 from femoreg_torch.detect.normalise import normalise
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera
 
-VISIBLE = 0.4  # confidence from which a landmark counts as seen; chosen on the patient that validated the training
+VISIBLE = 0.5  # confidence from which a landmark counts as seen; the confidences are calibrated, see the model card
+_MARGIN = 0.5  # landmarks that a turned or inverted reading must promise beyond the plain one
 
 
 @dataclass(frozen=True)
@@ -21,10 +23,12 @@ class Detection:
 
     pixels: Tensor  # (14, 2) float64 column, row in the image that was given
     confidence: Tensor  # (14,) float64 probability of the landmark being there
+    deviation_px: Tensor  # (14,) float64 standard deviation to expect of `pixels` along each axis
     visible: Tensor  # (14,) bool
     segmentation: Tensor  # (7, h, w) probabilities of background and bones 1 to 6
     network_camera: Camera  # of the segmentation's grid
     turned: bool  # the image was found to stand on its head; all results are for the image as it was given
+    inverted: bool = False  # the image was found to have bone dark where attenuation has it bright
 
 
 def load_network(path: Path | None = None) -> nn.Module:
@@ -37,17 +41,23 @@ def load_network(path: Path | None = None) -> nn.Module:
         raise InputError(str(error)) from error
 
 
-def detect(network: nn.Module, attenuation: Tensor, camera: Camera) -> Detection:
+def detect(network: nn.Module, attenuation: Tensor, camera: Camera, looks: tuple[Look, ...] = LOOKS) -> Detection:
     """Landmarks and bones in an `attenuation` image (H, W) of `camera`: bone bright, patient left on the right.
 
-    The image is looked at as it is and turned by 180°, and the reading of the higher total confidence is taken. Raises
-    `InputError` for an image that does not fit the camera, holds values that are not finite, or is constant.
+    The image is looked at as it is, turned by 180°, and both again with its grey values inverted. The reading that
+    promises the most landmarks wins, as it is unless another promises half a landmark more; several `looks` then refine
+    it. Raises `InputError` for an image that does
+    not fit the camera, holds values that are not finite, or is constant.
     """
     _check(attenuation, camera)
     image = normalise(to_network_grid(attenuation.to(torch.float32), camera))
-    readings = [_read(network, image), _read(network, image.rot90(2))]
-    turned = readings[1][1].sum().item() > readings[0][1].sum().item()
-    positions, confidence, segmentation = readings[int(turned)]
+    candidates = {(turned, inverted): _oriented(image, turned, inverted) for inverted in (0, 1) for turned in (0, 1)}
+    sure = {key: _confidence(network, candidate) for key, candidate in candidates.items()}
+    turned, inverted = max(sure, key=lambda key: sure[key] - _MARGIN * any(key))
+    reading = read_image(network, candidates[turned, inverted], looks)
+    positions, confidence = decode_heatmaps(reading.heatmaps, reading.absence)
+    deviation = expected_error(reading.heatmaps, positions)
+    segmentation = reading.segmentation.softmax(0)
     if turned:
         last = torch.tensor(segmentation.shape[:0:-1], dtype=torch.float64) - 1
         positions, segmentation = last - positions, segmentation.rot90(2, (1, 2))
@@ -57,8 +67,26 @@ def detect(network: nn.Module, attenuation: Tensor, camera: Camera) -> Detection
     size = torch.tensor(camera.shape[::-1], dtype=torch.float64)
     inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(1)
     return Detection(
-        pixels, confidence, (confidence >= VISIBLE) & inside, segmentation, grid.downsampled(factor), turned
+        pixels,
+        confidence,
+        deviation * factor * grid.pixel_mm[0] / float(sum(camera.pixel_mm) / 2),
+        (confidence >= VISIBLE) & inside,
+        segmentation,
+        grid.downsampled(factor),
+        bool(turned),
+        bool(inverted),
     )
+
+
+def _oriented(image: Tensor, turned: int, inverted: int) -> Tensor:
+    image = image.rot90(2) if turned else image
+    return -image if inverted else image
+
+
+def _confidence(network: nn.Module, image: Tensor) -> float:
+    """The number of landmarks to expect in a normalised image on the network's grid, by one look."""
+    reading = read_image(network, image, PLAIN)
+    return decode_heatmaps(reading.heatmaps, reading.absence)[1].sum().item()
 
 
 def _check(image: Tensor, camera: Camera) -> None:
@@ -70,11 +98,3 @@ def _check(image: Tensor, camera: Camera) -> None:
         raise InputError("detect: the image holds values that are not finite. Take -log of positive intensities only.")
     if image.min() == image.max():
         raise InputError(f"detect: every pixel of the image is {image.min().item():g}; nothing can be found in it.")
-
-
-@torch.inference_mode()
-def _read(network: nn.Module, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions (14, 2) on the output's grid, confidences (14,) and class probabilities of an image on the grid."""
-    prediction = network(image[None, None])
-    positions, confidence = decode_heatmaps(prediction.heatmaps[0], prediction.absence[0])
-    return positions, confidence, prediction.segmentation[0].softmax(0)

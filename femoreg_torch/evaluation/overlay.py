@@ -14,14 +14,13 @@ from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import check_matches, downsample, read_image
 from femoreg_torch.geometry import Camera, invert_rigid, project_points, transform_points
+from femoreg_torch.registration.prepare import device_attenuation
 from femoreg_torch.volume import (
     Volume,
     read_ct,
     read_labels,
-    read_mesh,
     resample_isotropic,
     structure_attenuation,
-    voxelise_mesh,
 )
 
 GREEN, RED, _MAGENTA = (0, 255, 0), (60, 60, 255), (255, 60, 255)  # blue, green, red
@@ -64,7 +63,7 @@ def _structures(case: Case) -> tuple[Volume, Volume, Volume | None]:
     pelvis, femur = (structure_attenuation(ct, labels, case.structures[name]) for name in ("pelvis", case.femur))
     if case.device is None:
         return pelvis, femur, None
-    return pelvis, femur, voxelise_mesh(read_mesh(case.device.model_path), 0.5, case.device.hu)
+    return pelvis, femur, device_attenuation(case.device)
 
 
 def draw_edges(picture: Picture, posed: Sequence[tuple[Volume, Tensor]], camera: Camera) -> None:

@@ -164,7 +164,7 @@ class _Renderer:
         camera_from_object = poses.camera_from(name)[view]
         where, drawn = self._last.get((name, view), (None, None))
         if drawn is None or where is None or not torch.equal(where, camera_from_object):
-            drawn = project([self._scene.volumes[name]], camera_from_object[None, None], self._camera)[0]
+            drawn = project([self._scene.objects[name].volume], camera_from_object[None, None], self._camera)[0]
             self._last[name, view] = (camera_from_object, drawn)
         return drawn
 

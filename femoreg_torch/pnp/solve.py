@@ -1,7 +1,8 @@
 """Pose of an object from landmarks in one image, robust against wrong ones.
 
 Hypotheses from small subsets (SQPnP: Terzakis and Lourakis, ECCV 2020), the one with the best consensus (MSAC: Torr and
-Zisserman, CVIU 78, 2000), then a Huber-weighted least-squares refinement of the reprojection error.
+Zisserman, CVIU 78, 2000), then a Huber-weighted least-squares refinement of the reprojection error. Where standard
+deviations of the landmarks are known, it is over all of them, in units of these, with a weak prior on the view.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import Camera, about_point, exp_se3, project_points, transform_points
+from femoreg_torch.geometry import Camera, project_points, transform_points
 
 Array = NDArray[np.float64]
 
@@ -27,6 +28,11 @@ _FLOOR_MM = 1.0  # least standard deviation of a landmark that the covariance as
 _HYPOTHESES = 400
 _SUBSET_SIZES = (4, 5, 6)
 _DEPTHS = (0.2, 1.0)  # of the source-to-detector distance: the object lies between source and detector
+_MIDDLE_DEPTHS = (0.45, 0.95)  # the same for the middle of the points: nobody lies on the tube or touches the detector
+_HUBER_DEVIATIONS = 1.5
+_ROTATION_DEG = 8.0  # greatest standard deviation, over all axes, of a start that is given; chosen on patient 101
+_STEPS = (0.01, 0.01, 0.01, 1, 1, 10)  # typical sizes of a twist, rad and mm
+_TILT_DEG = 30.0  # prior standard deviation of the beam about the patient's front-to-back axis, each way
 
 
 @dataclass(frozen=True)
@@ -36,20 +42,29 @@ class PnpResult:
     camera_from_object: Tensor  # (4, 4) float64
     inliers: Tensor  # (N,) bool: within 10 mm on the detector
     rms_px: float  # distance of the inliers from their landmarks
-    covariance: Tensor  # (6, 6) of (rotation in rad, translation in mm), camera axes, about the inliers' centroid
+    covariance: Tensor  # (6, 6) of (rotation in rad, translation in mm), camera axes, about the used points' centroid
 
 
-def solve_pnp(points: Tensor, pixels: Tensor, camera: Camera, weights: Tensor | None = None) -> PnpResult:
+def solve_pnp(
+    points: Tensor,
+    pixels: Tensor,
+    camera: Camera,
+    weights: Tensor | None = None,
+    deviations_px: Tensor | None = None,
+) -> PnpResult:
     """Pose of `points` (N, 3) in LPS mm that were seen at `pixels` (N, 2) (column, row) of `camera`.
 
-    `weights` (N,) are positive, for instance the confidences. Only poses are considered that have the points between
-    source and detector and the beam entering from the patient's front, which is the case wherever the image is shown
-    with patient left on the right and head up (or turned by 180°). The result does not depend on chance.
+    `weights` (N,) are positive, for instance the confidences. `deviations_px` (N,) are standard deviations of the
+    landmarks along each axis; with them the pose is the most probable one given that the beam runs from front to back
+    within about 30°, and the covariance is that of this posterior. Only poses are considered that have the points
+    between source and detector and the beam entering from the patient's front, which is the case wherever the image is
+    shown with patient left on the right and head up (or turned by 180°). The result does not depend on chance.
 
-    Raises `InputError` "too few usable landmarks …" when fewer than four, or fewer than half of the points, agree.
+    Raises `InputError` "too few usable landmarks …" when fewer than four, or fewer than half of the points, agree, or
+    if by `deviations_px` the rotation is uncertain by more than 8°.
     """
     weights = torch.ones(len(points)) if weights is None else weights
-    _check(points, pixels, weights)
+    _check(points, pixels, weights, deviations_px)
     object_points, image_points = (p.to(torch.float64).numpy() for p in (points, pixels))
     scale = weights.to(torch.float64).numpy()
     pixel_mm = float(np.mean(camera.pixel_mm))
@@ -62,16 +77,25 @@ def solve_pnp(points: Tensor, pixels: Tensor, camera: Camera, weights: Tensor | 
             break
         pose, covariance = _refine(pose, points[inliers], pixels[inliers], scale[inliers], camera)
         inliers = _distances(pose, points, pixels, camera) < limit_px
+    if pose is not None and _enough(inliers) and deviations_px is not None:
+        pose, covariance = _most_probable(pose, object_points, image_points, deviations_px.double().numpy(), camera)
+        inliers = _distances(pose, points, pixels, camera) < limit_px
     if pose is None or not _enough(inliers) or not _plausible(pose.numpy(), object_points, camera):
         raise InputError(
             f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree on a pose, but at least {MINIMUM} "
             "and half of them must. Take a view that shows more of the pelvis, or give the landmarks by hand."
         )
+    rotation_deg = float(torch.rad2deg(covariance[:3, :3].trace().sqrt()))
+    if deviations_px is not None and rotation_deg > _ROTATION_DEG:
+        raise InputError(
+            f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree, but they fix the rotation only to "
+            f"{rotation_deg:.0f}°. Take a view that shows more of the pelvis, or give the landmarks by hand."
+        )
     distances = _distances(pose, points, pixels, camera)[inliers]
     return PnpResult(pose, torch.from_numpy(inliers), float(np.sqrt((distances**2).mean())), covariance)
 
 
-def _check(points: Tensor, pixels: Tensor, weights: Tensor) -> None:
+def _check(points: Tensor, pixels: Tensor, weights: Tensor, deviations_px: Tensor | None) -> None:
     count = len(points)
     if points.shape != (count, 3) or pixels.shape != (count, 2) or weights.shape != (count,):
         raise InputError(
@@ -80,6 +104,8 @@ def _check(points: Tensor, pixels: Tensor, weights: Tensor) -> None:
         )
     if not all(torch.isfinite(values).all() for values in (points, pixels, weights)) or (weights <= 0).any():
         raise InputError("solve_pnp: points, pixels and weights must be finite, and weights positive.")
+    if deviations_px is not None and (deviations_px.shape != (count,) or not (deviations_px > 0).all()):
+        raise InputError(f"solve_pnp: deviations_px must be ({count},) and positive.")
     if count < MINIMUM:
         raise InputError(
             f"too few usable landmarks: {count} given, at least {MINIMUM} are needed. "
@@ -104,7 +130,9 @@ def _plausible(camera_from_object: Array, points: Array, camera: Camera) -> bool
     """Whether all points lie between source and detector and the beam runs from the patient's front to the back."""
     depth = points @ camera_from_object[2, :3] + camera_from_object[2, 3]
     low, high = (share * camera.sdd_mm for share in _DEPTHS)
-    return bool(depth.min() > low and depth.max() < high and camera_from_object[2, 1] > 0)
+    nearest, furthest = (share * camera.sdd_mm for share in _MIDDLE_DEPTHS)
+    between = depth.min() > low and depth.max() < high and nearest < depth.mean() < furthest
+    return bool(between and camera_from_object[2, 1] > 0)
 
 
 def _consensus(points: Array, pixels: Array, weights: Array, camera: Camera, limit_px: float) -> Tensor | None:
@@ -137,25 +165,72 @@ def _distances(camera_from_object: Tensor, points: Tensor, pixels: Tensor, camer
     return (projected - pixels).norm(dim=1).nan_to_num(torch.inf).numpy()
 
 
+@dataclass(frozen=True)
+class _Movable:
+    """Points about a pose that is turned about their middle and shifted by a twist (rotation vector, translation)."""
+
+    arms: Array  # (N, 3) from the middle, camera axes
+    centre: Array  # (3,) the middle in the camera frame
+    matrix: Array  # (3, 3) of the camera
+
+    def pixels(self, twist: Array) -> Array:
+        """(column, row) (N, 2) after the twist."""
+        turned = self.arms @ cv2.Rodrigues(twist[:3])[0].T + self.centre + twist[3:]
+        projected = turned @ self.matrix.T
+        return np.asarray(projected[:, :2] / projected[:, 2:])
+
+    def pose(self, twist: Array, camera_from_object: Array) -> Tensor:
+        """`camera_from_object` (4, 4) after the twist."""
+        turn = cv2.Rodrigues(twist[:3])[0]
+        pose = np.eye(4)
+        pose[:3, :3] = turn @ camera_from_object[:3, :3]
+        pose[:3, 3] = turn @ (camera_from_object[:3, 3] - self.centre) + self.centre + twist[3:]
+        return torch.from_numpy(pose)
+
+
+def _movable(camera_from_object: Array, points: Array, camera: Camera) -> _Movable:
+    in_camera = points @ camera_from_object[:3, :3].T + camera_from_object[:3, 3]
+    centre = in_camera.mean(0)
+    return _Movable(in_camera - centre, centre, camera.matrix().numpy())
+
+
 def _refine(
     camera_from_object: Tensor, points: Tensor, pixels: Tensor, weights: Array, camera: Camera
 ) -> tuple[Tensor, Tensor]:
     """The pose of least Huber loss near `camera_from_object`, and its covariance (6, 6)."""
-    centre = transform_points(camera_from_object, points.to(torch.float64)).mean(0)
-    pixel_mm = float(np.mean(camera.pixel_mm))
+    start = camera_from_object.numpy()
+    movable = _movable(start, points.double().numpy(), camera)
+    seen, pixel_mm = pixels.double().numpy(), float(np.mean(camera.pixel_mm))
     root = np.sqrt(weights / weights.mean())[:, None]
 
-    def moved(twist: Array) -> Tensor:
-        return about_point(exp_se3(torch.from_numpy(twist)), centre) @ camera_from_object
-
     def residuals_mm(twist: Array) -> Array:
-        projected = project_points(camera, transform_points(moved(twist), points.to(torch.float64)))
-        return (root * (projected - pixels).numpy() * pixel_mm).ravel()
+        return np.asarray((root * (movable.pixels(twist) - seen) * pixel_mm).ravel())
 
-    solution = least_squares(
-        residuals_mm, np.zeros(6), loss="huber", f_scale=_HUBER_MM, x_scale=[0.01, 0.01, 0.01, 1, 1, 10]
-    )
+    solution = least_squares(residuals_mm, np.zeros(6), loss="huber", f_scale=_HUBER_MM, x_scale=_STEPS)
     freedom = max(1, len(solution.fun) - 6)
     variance = max(_FLOOR_MM**2, float((solution.fun**2).sum()) / freedom)
     normal = solution.jac.T @ solution.jac
-    return moved(solution.x), torch.from_numpy(variance * np.linalg.pinv(normal))
+    return movable.pose(solution.x, start), torch.from_numpy(variance * np.linalg.pinv(normal))
+
+
+def _most_probable(
+    camera_from_object: Tensor, points: Array, pixels: Array, deviations_px: Array, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """The pose of greatest posterior near `camera_from_object`, and its covariance (6, 6) about the points' middle.
+
+    Residuals are in standard deviations; beyond 1.5 of them they count by Huber's rule. The beam's direction in the
+    patient is the third row of the rotation; its parts across the front-to-back axis are the prior's residuals.
+    """
+    start = camera_from_object.numpy()
+    movable = _movable(start, points, camera)
+    tilt = np.sin(np.radians(_TILT_DEG))
+
+    def residuals(twist: Array) -> Array:
+        offset = (movable.pixels(twist) - pixels) / deviations_px[:, None]
+        length = np.linalg.norm(offset, axis=1, keepdims=True).clip(1e-12)
+        linear = np.sqrt(np.maximum(2 * _HUBER_DEVIATIONS * length - _HUBER_DEVIATIONS**2, 0)) / length
+        beam = (cv2.Rodrigues(twist[:3])[0] @ start[:3, :3])[2]
+        return np.append((np.where(length < _HUBER_DEVIATIONS, 1, linear) * offset).ravel(), beam[[0, 2]] / tilt)
+
+    solution = least_squares(residuals, np.zeros(6), x_scale=_STEPS)
+    return movable.pose(solution.x, start), torch.from_numpy(np.linalg.pinv(solution.jac.T @ solution.jac))

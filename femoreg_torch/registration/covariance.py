@@ -23,7 +23,7 @@ class PoseCovariance:
     """Covariance (6 B, 6 B) of the motions of B bodies: of every object in camera 1, and of the C-arm of other views.
 
     A motion is a twist (degrees, mm) along the axes of its camera about the object's reference point, for a C-arm about
-    that of the pelvis.
+    that of the first object.
     """
 
     bodies: tuple[str, ...]  # object names, then "view 2", …
@@ -46,7 +46,7 @@ def pose_covariance(scene: Scene, poses: Poses, level: Level) -> PoseCovariance:
     objects = tuple(poses.camera1_from)
     bodies = [Body((name,), 0, reference_point_in_view(scene, poses, name, 0), scale) for name in objects]
     others = range(1, len(poses.camera_from_camera1))
-    bodies += [Body((), view, reference_point_in_view(scene, poses, "pelvis", view), scale) for view in others]
+    bodies += [Body((), view, reference_point_in_view(scene, poses, objects[0], view), scale) for view in others]
     images: list[tuple[Kind, int]] = [(kind, view) for kind in scene.images for view in (0, *others)]
     costs = image_costs(scene, poses, tuple(bodies), objects, images, level)
     model = stage_objective(costs, tuple(bodies), None).quadratic(torch.zeros(6 * len(bodies), dtype=torch.float64))

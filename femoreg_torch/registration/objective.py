@@ -10,9 +10,9 @@ from femoreg_torch.drr import project, project_with_jacobian
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, invert_rigid, transform_points
 from femoreg_torch.optimize import Quadratic, SmoothObjective
-from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, split
+from femoreg_torch.registration.scene import Body, Kind, Poses, RigidObject, Scene, split
+from femoreg_torch.registration.weights import Weighting, pixel_weights
 from femoreg_torch.similarity import GradNcc, grad_ncc, grad_ncc_quadratic
-from femoreg_torch.volume import Volume
 
 _STEP = 1e-5  # of a delta, for the derivatives of poses
 
@@ -47,18 +47,27 @@ class _Target:
 
 
 def _target(
-    scene: Scene, poses: Poses, bodies: Sequence[Body], render: Sequence[str], kind: Kind, view: int, level: Level
+    scene: Scene,
+    poses: Poses,
+    bodies: Sequence[Body],
+    render: Sequence[str],
+    image: tuple[Kind, int],
+    level: Level,
+    weights: Sequence[Weighting],
 ) -> _Target:
+    kind, view = image
     camera = scene.carm.camera.downsampled(level.downsample)
     fixed = downsample(scene.images[kind][view], level.downsample)
-    drawn = [name for name in render if kind == "device" or name != "device"]
+    drawn = scene.shown(render, kind)
     moves = {name for body in bodies for name in (drawn if body.view == view and body.view else body.objects)}
     still = [name for name in drawn if name not in moves]
     background = torch.zeros(camera.shape)
     if still:
         where = torch.stack([poses.camera_from(name)[view] for name in still])[None]
-        background = project([scene.volumes[name] for name in still], where, camera, level.step_mm)[0]
-    similarity = grad_ncc(fixed, level.patch_radius)
+        background = project([scene.objects[name].volume for name in still], where, camera, level.step_mm)[0]
+    placing = [name for body in bodies for name in body.objects]
+    looked_at = pixel_weights(scene, poses, render, placing, image, camera, level.step_mm, weights)
+    similarity = grad_ncc(fixed, level.patch_radius, weights=looked_at)
     return _Target(view, camera, similarity, background, tuple(name for name in drawn if name in moves))
 
 
@@ -66,8 +75,7 @@ def _target(
 class ImageCosts:
     """Similarity costs of images as functions of deltas (P, Σ n_b) of bodies; made by `image_costs`."""
 
-    volumes: dict[str, Volume]
-    centres: dict[str, Tensor]  # (3,) mm in the object's own space, see `Scene.reference_points`
+    objects: dict[str, RigidObject]
     poses: Poses
     bodies: tuple[Body, ...]
     step_mm: float
@@ -79,7 +87,7 @@ class ImageCosts:
         for target in self.targets:
             drawn = target.background.expand(len(deltas), *target.camera.shape)
             if target.moving:
-                volumes = [self.volumes[name] for name in target.moving]
+                volumes = [self.objects[name].volume for name in target.moving]
                 drawn = drawn + project(volumes, self._placed(target, deltas), target.camera, self.step_mm)
             columns.append(target.similarity(drawn))
         return torch.stack(columns, 1)
@@ -104,8 +112,9 @@ class ImageCosts:
         drawn, jacobians, twists = target.background, [], []
         placed = self._placed(target, delta[None])[0]  # (O, 4, 4)
         for name, pose, change in zip(target.moving, placed, self._changes(target, delta), strict=True):
-            centre = transform_points(pose, self.centres[name][None])[0]
-            image, jacobian = project_with_jacobian(self.volumes[name], pose[None], target.camera, centre, self.step_mm)
+            volume = self.objects[name].volume
+            centre = transform_points(pose, self.objects[name].reference_point[None])[0]
+            image, jacobian = project_with_jacobian(volume, pose[None], target.camera, centre, self.step_mm)
             drawn = drawn + image[0]
             jacobians.append(jacobian[0])
             twists.append(_twists(change, pose, centre))
@@ -137,13 +146,15 @@ def image_costs(
     render: Sequence[str],
     images: Sequence[tuple[Kind, int]],
     level: Level,
+    weights: Sequence[Weighting] = (),
 ) -> ImageCosts:
     """Similarity costs of `images`, (kind, view) pairs, as functions of deltas (P, Σ n_b) of the bodies.
 
-    Objects of `render` that no body moves are drawn once and added.
+    Objects of `render` that no body moves are drawn once and added. `weights` says which pixels count, see
+    `pixel_weights`, by default all. Raises `InputError` for an image that they leave no pixel of.
     """
-    targets = tuple(_target(scene, poses, bodies, render, kind, view, level) for kind, view in images)
-    return ImageCosts(scene.volumes, scene.reference_points, poses, bodies, level.step_mm, targets)
+    targets = tuple(_target(scene, poses, bodies, render, image, level, weights) for image in images)
+    return ImageCosts(scene.objects, poses, bodies, level.step_mm, targets)
 
 
 def _camera_from(

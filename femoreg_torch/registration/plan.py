@@ -1,6 +1,6 @@
 """A workflow as data: the steps that a preset in `configs/registration/` lists."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from jsonargparse import ArgumentError, ArgumentParser
@@ -9,13 +9,15 @@ from femoreg_torch.configs import load_preset
 from femoreg_torch.errors import InputError
 from femoreg_torch.optimize import Bobyqa, CmaEs, LevenbergMarquardt
 from femoreg_torch.registration.objective import Level, Prior
+from femoreg_torch.registration.scene import Kind
+from femoreg_torch.registration.weights import Weighting
 
-ObjectName = Literal["pelvis", "femur", "device"]
+VIEW, VIEWS = "view", "views"
 
 
 @dataclass(frozen=True)
 class BodyPlan:
-    """A body to move: `move` names objects that move together, or the C-arm of a view.
+    """A body to move: `move` names objects of the scene that move together, or the C-arm of a view.
 
     [view] is the view at hand in a stage for each other view, [views] stands for one body per view but the first.
     `rotation_deg` and `translation_mm` are per axis of the camera (x along columns, y along rows, z depth): the
@@ -23,43 +25,69 @@ class BodyPlan:
     Zero freezes an axis.
     """
 
-    move: list[ObjectName | Literal["view", "views"]]
-    centre: ObjectName
+    move: list[str]
+    centre: str
     rotation_deg: list[float]
     translation_mm: list[float]
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One optimisation. `images` says which views take part: the first, each other view by itself, or all together."""
+    """One optimisation. `images` says which views take part: the first, each other view by itself, or all together.
+
+    Objects are named as in the scene. `weights` says which pixels count, see `pixel_weights`; by default all do.
+    """
 
     name: str
     images: Literal["first", "each other", "all"]
-    kinds: list[Literal["anatomy", "device"]]
-    render: list[ObjectName]
+    kinds: list[Kind]
+    render: list[str]
     bodies: list[BodyPlan]
     level: Level
     optimiser: CmaEs | Bobyqa | LevenbergMarquardt
     prior: Prior | None = None
+    weights: list[Weighting] = field(default_factory=list)
+
+    @property
+    def objects(self) -> set[str]:
+        """The names of all objects that it draws, moves or turns about."""
+        moved = {name for body in self.bodies for name in body.move} - {VIEW, VIEWS}
+        return {*self.render, *moved, *(body.centre for body in self.bodies)}
 
 
 @dataclass(frozen=True)
 class OrbitSearch:
-    """Exhaustive search of every other view along the C-arm's orbit, from the first view."""
+    """Exhaustive search of every other view along the C-arm's orbit, from the first view, in images of one kind."""
 
     name: str
-    render: list[ObjectName]
+    render: list[str]
     half_range_deg: float
     step_deg: float
     level: Level
+    kind: Kind = "anatomy"
+
+    @property
+    def kinds(self) -> list[Kind]:
+        """The kinds of images that it looks at."""
+        return [self.kind]
+
+    @property
+    def objects(self) -> set[str]:
+        """The names of all objects that it draws."""
+        return set(self.render)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All steps of a registration, in order. Steps that render the device are left out where a case has none."""
+    """All steps of a registration, in order. Steps that look at images which a case lacks are left out."""
 
     preset: str
     steps: tuple[Stage | OrbitSearch, ...]
+
+    @property
+    def needs_segmentations(self) -> bool:
+        """Whether a stage weighs pixels by what the network sees in every view."""
+        return any(isinstance(step, Stage) and "bones" in step.weights for step in self.steps)
 
 
 def load_plan(preset: str) -> Plan:

@@ -2,22 +2,26 @@
 
 from torch import Tensor
 
-from femoreg_torch.case import Case, View
+from femoreg_torch.case import Case, Device, View
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import attenuation_image, check_matches, read_image
-from femoreg_torch.registration.scene import Kind, Scene
+from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.volume import (
+    Volume,
     check_inside,
     label_box_centre,
+    labelled_device,
     read_ct,
     read_labels,
     read_mesh,
     resample_isotropic,
+    scanned_device,
     structure_attenuation,
     voxelise_mesh,
 )
 
 REGISTRATION_SPACING_MM = 1.0  # the paper resamples the CT to 1 mm (section III-A)
+_CLASSES = {"pelvis": (1, 2, 4), "femur_left": (5,), "femur_right": (6,)}  # of the landmark network's segmentation
 DEVICE_SPACING_MM = 0.5  # a sleeve's wall is thinner than a CT voxel
 
 
@@ -36,15 +40,25 @@ def prepare_scene(case: Case) -> Scene:
     if max(abs(s - REGISTRATION_SPACING_MM) for s in ct.spacing_mm) > 1e-3:
         labels = resample_isotropic(labels, REGISTRATION_SPACING_MM, nearest=True)
         ct = resample_isotropic(ct, REGISTRATION_SPACING_MM)
-    volumes = {
-        "pelvis": structure_attenuation(ct, labels, pelvis_ids),
-        "femur": structure_attenuation(ct, labels, femur_ids),
+    pelvis, femur = (structure_attenuation(ct, labels, ids) for ids in (pelvis_ids, femur_ids))
+    always: tuple[Kind, ...] = ("anatomy", "device")
+    objects = {
+        "pelvis": RigidObject(pelvis, middle, always, classes=_CLASSES["pelvis"]),
+        "femur": RigidObject(femur, case.femoral_head, always, classes=_CLASSES[case.femur]),
     }
-    points = {"pelvis": middle, "femur": case.femoral_head}
     if case.device is not None:
-        volumes["device"] = voxelise_mesh(read_mesh(case.device.model_path), DEVICE_SPACING_MM, case.device.hu)
-        points["device"] = case.device.points["center"]
-    return Scene(case.carm, volumes, points, images)
+        device, centre = device_attenuation(case.device), case.device.points["center"]
+        objects["device"] = RigidObject(device, centre, ("device",), case.device.camera1_from_device)
+    return Scene(case.carm, objects, images)
+
+
+def device_attenuation(device: Device) -> Volume:
+    """Attenuation (1/mm) of a device in its own space. Raises `InputError` for a mesh or volume that does not fit."""
+    if device.hu is None:
+        return scanned_device(device.model_path)
+    if device.labels is not None:
+        return labelled_device(device.model_path, device.labels, device.hu, DEVICE_SPACING_MM)
+    return voxelise_mesh(read_mesh(device.model_path), DEVICE_SPACING_MM, device.hu)
 
 
 def read_images(case: Case) -> dict[Kind, tuple[Tensor, ...]]:

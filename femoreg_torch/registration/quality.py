@@ -53,13 +53,13 @@ class ObjectQuality:
 
 
 def assess(scene: Scene, poses: Poses, limits: Limits) -> dict[str, ObjectQuality]:
-    """Quality of every object placed in `poses`: bones in the anatomy images, the device in the device images."""
+    """Quality of every object placed in `poses`, in the first kind of images that shows it."""
     covariance = pose_covariance(scene, poses, _LEVEL)
     return {name: _assess_object(scene, poses, name, covariance, limits) for name in poses.camera1_from}
 
 
 def _assess_object(scene: Scene, poses: Poses, name: str, covariance: PoseCovariance, limits: Limits) -> ObjectQuality:
-    kind: Kind = "device" if name == "device" else "anatomy"
+    kind = scene.objects[name].shown_in[0]
     views = tuple(_assess_view(scene, poses, name, kind, view) for view in range(len(scene.images[kind])))
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
@@ -99,7 +99,7 @@ def _assess_view(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -
     centre = reference_point_in_view(scene, local, name, view)
     scale = torch.tensor([0, 0, 0, _PROBE_MM, _PROBE_MM, 0], dtype=torch.float64)
     body = Body((name,), 0, centre, scale)
-    drawn = [n for n in poses.camera1_from if n != "device" or kind == "device"]
+    drawn = scene.shown(poses.camera1_from, kind)
     probes = torch.tensor([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=torch.float64)
     costs = image_costs(scene, local, (body,), drawn, [(kind, view)], _LEVEL)(probes)[:, 0].tolist()
     others = [n for n in drawn if n != name]

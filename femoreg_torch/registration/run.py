@@ -10,7 +10,7 @@ from femoreg_torch.registration.plan import Plan, load_plan
 from femoreg_torch.registration.prepare import prepare_scene
 from femoreg_torch.registration.quality import Limits, assess
 from femoreg_torch.registration.report import result_content
-from femoreg_torch.registration.start import Detector, start_from_landmarks
+from femoreg_torch.registration.start import Detector, start_from_landmarks, with_segmentations
 from femoreg_torch.registration.workflow import Report, run_plan
 
 
@@ -26,16 +26,21 @@ def register_case(case: Case, preset: str, seed: int, weights: Path | None, repo
 
 
 def register_by_plan(case: Case, plan: Plan, seed: int, find: Detector, report: Report) -> dict[str, Any]:
-    """The same by any plan, and from the landmarks that `find` sees in view 1."""
+    """The same by any plan, and from the landmarks that `find` sees in view 1.
+
+    Where a stage weighs pixels by the bones, `find` looks at every view.
+    """
     clock = {"began": time.perf_counter()}
     report("reading CT and images", 0.0)
     scene = prepare_scene(case)
     clock["prepared"] = time.perf_counter()
     report("finding landmarks", 0.0)
-    camera1_from_pelvis, start = start_from_landmarks(case, scene, find)
+    seen = find(scene.images["anatomy"][0], scene.carm.camera)
+    camera1_from_pelvis, start = start_from_landmarks(case, seen)
+    if plan.needs_segmentations:
+        scene = with_segmentations(scene, seen, find)
     clock["started"] = time.perf_counter()
-    camera1_from_device = None if case.device is None else case.device.camera1_from_device
-    outcome = run_plan(scene, plan, camera1_from_pelvis, camera1_from_device, seed, report)
+    outcome = run_plan(scene, plan, camera1_from_pelvis, seed, report)
     clock["registered"] = time.perf_counter()
     quality = assess(scene, outcome.poses, Limits())
     done = time.perf_counter()

@@ -1,25 +1,63 @@
 """What is registered: volumes of the rigid objects, the fluoroscopic images, and the poses that tie them together."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from femoreg_torch.geometry import CArm, about_point, exp_se3, transform_points
+from femoreg_torch.geometry import Camera, CArm, about_point, exp_se3, transform_points
 from femoreg_torch.volume import Volume
 
 Kind = Literal["anatomy", "device"]  # an image without the device, or with it
 
 
 @dataclass(frozen=True, eq=False)
+class RigidObject:
+    """Something rigid that is registered, in a space of its own: the CT's LPS or that of its CAD model, mm."""
+
+    volume: Volume  # attenuation, 1/mm
+    reference_point: Tensor  # (3,) mm: what rotations turn about
+    shown_in: tuple[Kind, ...]  # the kinds of images that hold it
+    camera1_from: Tensor | None = None  # (4, 4) nominal start pose; None for what starts where the CT has it
+    classes: tuple[int, ...] = ()  # of the segmentation that show it; none for what the network does not know
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """What the network sees in the anatomy image of one view."""
+
+    probabilities: Tensor  # (C, h, w) of the classes
+    camera: Camera  # of their grid, on the detector of the image
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
-    """The fixed part of a registration. Objects are named pelvis, femur and device."""
+    """The fixed part of a registration: named objects and images."""
 
     carm: CArm
-    volumes: dict[str, Volume]  # attenuation, 1/mm, in the object's own space (LPS or CAD)
-    reference_points: dict[str, Tensor]  # (3,) mm in the object's own space: what rotations turn about
+    objects: dict[str, RigidObject]
     images: dict[Kind, tuple[Tensor, ...]]  # attenuation images (H, W), one per view
+    segmentations: tuple[Segmentation, ...] = ()  # one per view; none unless a stage weighs its pixels by them
+
+    @property
+    def views(self) -> int:
+        """The number of C-arm poses."""
+        return len(self.images["anatomy"])
+
+    def shown(self, names: Iterable[str], kind: Kind) -> list[str]:
+        """Those of the named objects that images of a kind hold."""
+        return [name for name in names if kind in self.objects[name].shown_in]
+
+    def start(self, camera1_from_ct: Tensor) -> "Poses":
+        """Poses at the start of all objects that any image holds, given where the CT lies, (4, 4), in view 1."""
+        placed = {
+            name: camera1_from_ct if thing.camera1_from is None else thing.camera1_from
+            for name, thing in self.objects.items()
+            if any(kind in self.images for kind in thing.shown_in)
+        }
+        return first_view_only(placed, self.views)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +109,7 @@ class Body:
 
 def reference_point_in_view(scene: Scene, poses: Poses, name: str, view: int) -> Tensor:
     """The reference point (3,) of an object, mm, in the camera of a view."""
-    return transform_points(poses.camera_from(name)[view], scene.reference_points[name][None])[0]
+    return transform_points(poses.camera_from(name)[view], scene.objects[name].reference_point[None])[0]
 
 
 def split(deltas: Tensor, bodies: tuple[Body, ...]) -> list[Tensor]:

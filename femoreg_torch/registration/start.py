@@ -1,6 +1,7 @@
 """The start pose: landmarks that the network finds in view 1, and PnP (paper, section II-A)."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,18 +12,17 @@ from femoreg_torch.detect import Detection
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera
 from femoreg_torch.pnp import PnpResult, solve_pnp
-from femoreg_torch.registration.scene import Scene
+from femoreg_torch.registration.scene import Scene, Segmentation
 from femoreg_torch.volume import HIP_LANDMARKS
 
 Detector = Callable[[Tensor, Camera], Detection]  # finds the landmarks in an attenuation image (H, W) of a camera
 
 
-def start_from_landmarks(case: Case, scene: Scene, find: Detector) -> tuple[Tensor, dict[str, Any]]:
-    """`camera1_from_pelvis` (4, 4) from the landmarks that `find` sees in view 1, and what to keep of how it came.
+def start_from_landmarks(case: Case, detection: Detection) -> tuple[Tensor, dict[str, Any]]:
+    """`camera1_from_pelvis` (4, 4) from the landmarks that are seen in view 1, and what to keep of how it came.
 
     Raises `InputError` if fewer than four landmarks are of use.
     """
-    detection = find(scene.images["anatomy"][0], scene.carm.camera)
     usable = [i for i, name in enumerate(HIP_LANDMARKS) if name in case.landmarks and bool(detection.visible[i])]
     if len(usable) < 4:
         raise InputError(
@@ -30,8 +30,16 @@ def start_from_landmarks(case: Case, scene: Scene, find: Detector) -> tuple[Tens
             "and is `intensity` of the view right (raw: bone dark, log: bone bright)?"
         )
     points = torch.stack([case.landmarks[HIP_LANDMARKS[i]] for i in usable])
-    pose = solve_pnp(points, detection.pixels[usable], scene.carm.camera, detection.confidence[usable])
+    seen = (detection.pixels[usable], case.carm.camera, detection.confidence[usable], detection.deviation_px[usable])
+    pose = solve_pnp(points, *seen)
     return pose.camera_from_object, _summary(detection, pose, usable)
+
+
+def with_segmentations(scene: Scene, first: Detection, find: Detector) -> Scene:
+    """The scene with what the network sees of the bones in every view; `first` is what it saw in view 1."""
+    others = [find(image, scene.carm.camera) for image in scene.images["anatomy"][1:]]
+    seen = tuple(Segmentation(found.segmentation, found.network_camera) for found in (first, *others))
+    return replace(scene, segmentations=seen)
 
 
 def _summary(detection: Detection, pose: PnpResult, usable: list[int]) -> dict[str, Any]:

@@ -1,28 +1,21 @@
 """The registration workflow: start pose from landmarks, then the steps of a plan (paper, section II-B)."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from femoreg_torch.drr import project
+from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import orbit_angles
 from femoreg_torch.optimize import Result, minimise
 from femoreg_torch.registration.moments import Moment, moments_of
 from femoreg_torch.registration.objective import image_costs, stage_objective
-from femoreg_torch.registration.plan import BodyPlan, OrbitSearch, Plan, Stage
-from femoreg_torch.registration.scene import (
-    Body,
-    Kind,
-    Poses,
-    Scene,
-    first_view_only,
-    moved,
-    reference_point_in_view,
-)
+from femoreg_torch.registration.plan import VIEW, VIEWS, BodyPlan, OrbitSearch, Plan, Stage
+from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, moved, reference_point_in_view
 from femoreg_torch.similarity import grad_ncc
 
 Report = Callable[[str, float], None]  # what is done, and the share of the plan behind it
@@ -50,19 +43,21 @@ class Outcome:
     trace: tuple[StepTrace, ...]
 
 
-def run_plan(
-    scene: Scene, plan: Plan, camera1_from_pelvis: Tensor, camera1_from_device: Tensor | None, seed: int, report: Report
-) -> Outcome:
-    """Run all steps of a plan from a start pose (4, 4) of the pelvis in view 1 and a nominal one of the device.
+def run_plan(scene: Scene, plan: Plan, camera1_from_ct: Tensor, seed: int, report: Report) -> Outcome:
+    """Run all steps of a plan from a start pose (4, 4) of the CT in view 1 and the nominal poses of other objects.
 
-    The femur starts where the CT has it. Steps that need the device's images are left out where there are none.
+    Steps that look at images of a kind that the scene lacks are left out. Raises `InputError` for a step that names an
+    object which the scene lacks or no image holds.
     """
-    start = {"pelvis": camera1_from_pelvis, "femur": camera1_from_pelvis}
-    if camera1_from_device is not None and "device" in scene.images:
-        start["device"] = camera1_from_device
-    poses = first_view_only(start, len(scene.images["anatomy"]))
+    poses = scene.start(camera1_from_ct)
     trace: list[StepTrace] = []
-    steps = [step for step in plan.steps if "device" in start or "device" not in step.render]
+    steps = [step for step in plan.steps if all(kind in scene.images for kind in step.kinds)]
+    if any(isinstance(step, OrbitSearch) for step in plan.steps if step not in steps):
+        raise InputError(
+            f"registration preset {plan.preset}: it finds the C-arm of the other views by the device, but not every "
+            "view of this case has an image with it. Choose another preset."
+        )
+    _check_objects(plan.preset, steps, poses)
     for number, step in enumerate(steps):
         report(step.name, number / len(steps))
         for entry in _run_step(scene, poses, step, seed * 1000 + number):
@@ -72,8 +67,17 @@ def run_plan(
     return Outcome(poses, tuple(trace))
 
 
+def _check_objects(preset: str, steps: Sequence[Stage | OrbitSearch], poses: Poses) -> None:
+    for step in steps:
+        for name in sorted(step.objects - set(poses.camera1_from)):
+            raise InputError(
+                f"registration preset {preset}, step “{step.name}”: the images of this case hold no object “{name}”; "
+                f"there are: {', '.join(poses.camera1_from)}."
+            )
+
+
 def _run_step(scene: Scene, poses: Poses, step: Stage | OrbitSearch, seed: int) -> Iterator[StepTrace]:
-    others = range(1, len(scene.images["anatomy"]))
+    others = range(1, scene.views)
     if isinstance(step, OrbitSearch):
         for view in others:
             entry = search_orbit(scene, poses, step, view)
@@ -84,7 +88,7 @@ def _run_step(scene: Scene, poses: Poses, step: Stage | OrbitSearch, seed: int) 
             entry = run_stage(scene, poses, step, (view,), seed)
             poses = entry.poses
             yield entry
-    else:
+    elif others or any(body.move != [VIEWS] for body in step.bodies):  # of the only view, the C-arm stays
         yield run_stage(scene, poses, step, (0,) if step.images == "first" else (0, *others), seed)
 
 
@@ -93,7 +97,7 @@ def run_stage(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], 
     began = time.perf_counter()
     bodies = tuple(body for plan in stage.bodies for body in _bodies(scene, poses, plan, views))
     images: list[tuple[Kind, int]] = [(kind, view) for kind in stage.kinds for view in views]
-    costs = image_costs(scene, poses, bodies, stage.render, images, stage.level)
+    costs = image_costs(scene, poses, bodies, stage.render, images, stage.level, stage.weights)
     objective = stage_objective(costs, bodies, stage.prior)
     result = minimise(objective, sum(len(body.free) for body in bodies), stage.optimiser, seed)
     view = views[0] if stage.images == "each other" else None
@@ -107,8 +111,8 @@ def _bodies(scene: Scene, poses: Poses, plan: BodyPlan, views: tuple[int, ...]) 
     """The bodies of one entry: objects, the C-arm of the view at hand, or those of all views but the first."""
     scale = torch.tensor([*plan.rotation_deg, *plan.translation_mm], dtype=torch.float64)
     scale[:3] *= torch.pi / 180
-    moving = [view for view in views if view] if plan.move == ["views"] else views[:1] if plan.move == ["view"] else []
-    if moving:
+    if plan.move in ([VIEW], [VIEWS]):
+        moving = views[:1] if plan.move == [VIEW] else [view for view in views if view]
         return [Body((), view, reference_point_in_view(scene, poses, plan.centre, view), scale) for view in moving]
     return [Body(tuple(plan.move), 0, reference_point_in_view(scene, poses, plan.centre, 0), scale)]
 
@@ -117,10 +121,11 @@ def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> 
     """Place the C-arm of one view at the angle of its orbit, from view 1, that fits its image best."""
     began = time.perf_counter()
     orbit = scene.carm.orbit(orbit_angles(search.half_range_deg, search.step_deg))  # (N, 4, 4)
-    where = torch.stack([orbit @ poses.camera1_from[name] for name in search.render], 1)  # (N, O, 4, 4)
+    drawn_names = scene.shown(search.render, search.kind)
+    where = torch.stack([orbit @ poses.camera1_from[name] for name in drawn_names], 1)  # (N, O, 4, 4)
     camera = scene.carm.camera.downsampled(search.level.downsample)
-    drawn = project([scene.volumes[name] for name in search.render], where, camera, search.level.step_mm)
-    fixed = downsample(scene.images["anatomy"][view], search.level.downsample)
+    drawn = project([scene.objects[name].volume for name in drawn_names], where, camera, search.level.step_mm)
+    fixed = downsample(scene.images[search.kind][view], search.level.downsample)
     values = grad_ncc(fixed, search.level.patch_radius)(drawn)
     best = int(values.argmin())
     after = poses.with_view(view, orbit[best])

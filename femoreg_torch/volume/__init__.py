@@ -1,11 +1,12 @@
 """Volumes of the CT and of the device, their attenuation, and the landmarks of the hip."""
 
 from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
+from femoreg_torch.volume.device import labelled_device, scanned_device
 from femoreg_torch.volume.grid import Volume, axis_aligned
 from femoreg_torch.volume.labels import label_box_centre
 from femoreg_torch.volume.landmarks import HIP_LANDMARKS, LANDMARK_STEMS, check_inside, read_landmarks, write_landmarks
 from femoreg_torch.volume.mesh import check_closed, read_mesh, voxelise_mesh
-from femoreg_torch.volume.reading import read_ct, read_labels, write_volume
+from femoreg_torch.volume.reading import read_ct, read_labels, read_volume, write_volume
 from femoreg_torch.volume.resample import crop, resample_isotropic
 
 __all__ = [
@@ -18,11 +19,14 @@ __all__ = [
     "crop",
     "hu_to_attenuation",
     "label_box_centre",
+    "labelled_device",
     "read_ct",
     "read_labels",
     "read_landmarks",
     "read_mesh",
+    "read_volume",
     "resample_isotropic",
+    "scanned_device",
     "structure_attenuation",
     "voxelise_mesh",
     "write_landmarks",

@@ -65,17 +65,23 @@ def _lps_from_index(image: sitk.Image) -> Tensor:
     return torch.from_numpy(affine)
 
 
-def read_ct(path: Path) -> Volume:
-    """A CT in HU: float32 (Z, Y, X) on its own grid, index axes closest to +L, +P, +S, exact affine (also oblique).
+def read_volume(path: Path) -> Volume:
+    """Any volume as float32 (Z, Y, X) on its own grid, index axes closest to +L, +P, +S, exact affine (also oblique).
 
     `path` is a NIfTI, NRRD or MHA file or the folder of one DICOM series. Raises `InputError` for what cannot be read,
-    is not 3-D, is mirrored, holds values that are not finite, or does not look like HU.
+    is not 3-D, is mirrored, or holds values that are not finite.
     """
     image = _read(path)
     data = torch.from_numpy(sitk.GetArrayViewFromImage(image).astype(np.float32))
-    lowest, highest = (v.item() for v in data.aminmax())
-    if not np.isfinite([lowest, highest]).all() or holds_non_finite(Path(path)):
+    if not torch.isfinite(data).all() or holds_non_finite(Path(path)):
         raise InputError(f"{path}: holds values that are not finite (NaN or infinite). Repair or export it anew.")
+    return Volume(data, _lps_from_index(image))
+
+
+def read_ct(path: Path) -> Volume:
+    """A CT in HU, as `read_volume` reads it. Raises `InputError` for what that refuses and for what is not in HU."""
+    volume = read_volume(path)
+    lowest, highest = (v.item() for v in volume.data.aminmax())
     if lowest == highest:
         raise InputError(f"{path}: every voxel is {lowest:g}; a CT in HU was expected.")
     if lowest > _FAT_HU or highest < _BONE_HU:
@@ -83,7 +89,7 @@ def read_ct(path: Path) -> Volume:
             f"{path}: values run from {lowest:g} to {highest:g}, but a CT in HU has air or fat (below {_FAT_HU}) and "
             f"bone (above {_BONE_HU}). Export it in Hounsfield units (rescale applied, no window, no attenuation)."
         )
-    return Volume(data, _lps_from_index(image))
+    return volume
 
 
 def read_labels(path: Path, like: Volume) -> Volume:

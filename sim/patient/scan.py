@@ -1,5 +1,6 @@
 """A procedural patient in the scanner: CT, labels, landmarks. Everything is computed, no data file is read."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -34,7 +35,7 @@ class Patient:
     parameters: dict[str, float]
 
 
-def _box(skeleton: Skeleton, parameters: PatientParameters) -> tuple[Points, Points]:
+def _box(skeleton: Skeleton, parameters: PatientParameters, bottom_mm: float) -> tuple[Points, Points]:
     """Corners (3,) in whole mm, with room for the soft tissue and air around it."""
     lows, highs = [], []
     for field in skeleton.bones.values():
@@ -44,7 +45,7 @@ def _box(skeleton: Skeleton, parameters: PatientParameters) -> tuple[Points, Poi
     room = 22 + 18 * parameters.habitus
     lo -= [room + 24, room + 12, 0]
     hi += [room + 24, room + 18, -4]
-    lo[2] = -BELOW_MM
+    lo[2] = bottom_mm
     return np.floor(lo), np.ceil(hi)
 
 
@@ -104,16 +105,41 @@ def make_patient(seed: int, spacing_mm: float = 1.0) -> Patient:
         CT in HU and labels (1 left hip, 2 right, 3 vertebrae, 4 sacrum, 5 left femur, 6 right) on one grid
         along the LPS axes, whose origin lies midway between the femoral heads; landmarks in LPS mm; parameters.
     """
+    return make_scans(seed, (spacing_mm,))[0]
+
+
+def make_scans(seed: int, spacings_mm: Sequence[float]) -> list[Patient]:
+    """The patient of one seed at several voxel sizes, as `make_patient` gives each."""
     if seed < 0:
         raise InputError(f"patient: seed is {seed}, expected 0 or more.")
-    if not 0.5 <= spacing_mm <= 2:
-        raise InputError(f"patient: spacing is {spacing_mm} mm, expected 0.5 to 2 mm.")
-    shape_seed, tissue_seed, noise_seed, *bone_seeds = np.random.SeedSequence(seed).spawn(3 + len(LABELS))
+    for spacing_mm in spacings_mm:
+        if not 0.5 <= spacing_mm <= 2:
+            raise InputError(f"patient: spacing is {spacing_mm} mm, expected 0.5 to 2 mm.")
+    shape_seed, *scan_seeds = np.random.SeedSequence(seed).spawn(3 + len(LABELS))
     shape_rng = np.random.default_rng(shape_seed)
     parameters = draw_parameters(shape_rng)
     skeleton = build_skeleton(parameters, shape_rng)
     landmarks = find_landmarks(skeleton)
-    lo, hi = _box(skeleton, parameters)
+    points = {name: torch.from_numpy(landmarks[name].copy()) for name in HIP_LANDMARKS}
+    numbers = {k: float(v) for k, v in asdict(parameters).items()}
+    scans = [scan_skeleton(skeleton, parameters, -BELOW_MM, scan_seeds, spacing_mm) for spacing_mm in spacings_mm]
+    return [Patient(ct, labels, points, numbers) for ct, labels in scans]
+
+
+def scan_skeleton(
+    skeleton: Skeleton,
+    parameters: PatientParameters,
+    bottom_mm: float,
+    seeds: list[np.random.SeedSequence],
+    spacing_mm: float,
+) -> tuple[Volume, Volume]:
+    """CT in HU and labels (as in `LABELS`) of a skeleton in soft tissue, down to `bottom_mm` from the femoral heads.
+
+    Of `parameters` the bone density, the cortex and the habitus count; `seeds` are those of soft tissue, noise, and
+    each bone's texture.
+    """
+    tissue_seed, noise_seed, *bone_seeds = seeds
+    lo, hi = _box(skeleton, parameters, bottom_mm)
     tissue = make_soft_tissue(lo, hi, skeleton, parameters, np.random.default_rng(tissue_seed))
     lo, hi = _around_body(tissue, lo, hi)
     axes = Axes(*(np.arange(lo[k] + spacing_mm / 2, hi[k], spacing_mm) for k in range(3)))
@@ -124,5 +150,4 @@ def make_patient(seed: int, spacing_mm: float = 1.0) -> Patient:
     def volume(values: Array | NDArray[np.uint8]) -> Volume:
         return Volume(torch.from_numpy(np.ascontiguousarray(values.transpose(2, 1, 0))), lps_from_index)
 
-    points = {name: torch.from_numpy(landmarks[name].copy()) for name in HIP_LANDMARKS}
-    return Patient(volume(hu), volume(labels), points, {k: float(v) for k, v in asdict(parameters).items()})
+    return volume(hu), volume(labels)

@@ -83,6 +83,18 @@ def test_a_case_without_what_is_optional_comes_back(tmp_path: Path) -> None:
     assert_same(read_case(tmp_path), case)
 
 
+@pytest.mark.parametrize(("hu", "labels"), [(5000.0, (3, 7)), (None, None)])
+def test_a_device_as_a_volume_comes_back(tmp_path: Path, hu: float | None, labels: tuple[int, ...] | None) -> None:
+    case = example(tmp_path)
+    assert case.device is not None
+    (tmp_path / "device.nrrd").touch()
+    device = replace(case.device, model_path=tmp_path / "device.nrrd", hu=hu, labels=labels)
+    write_case(tmp_path, replace(case, device=device))
+    assert_same(read_case(tmp_path).device, device)
+    written = yaml.safe_load((tmp_path / "case.yaml").read_text())["device"]
+    assert ("model" in written, written["volume"]) == (False, "device.nrrd")
+
+
 def test_files_outside_the_folder_are_found_from_it(tmp_path: Path) -> None:
     case = example(tmp_path)
     (tmp_path / "made").mkdir()
@@ -100,6 +112,13 @@ def test_names_that_follow_the_side(tmp_path: Path) -> None:
 Change = Callable[[dict[str, Any]], object]
 SCALED = [[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1]]
 MIRRORED = [[-1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1]]
+
+
+def as_volume(content: dict[str, Any], file: str, **change: Any) -> None:
+    """Give the device as a volume instead of a mesh."""
+    del content["device"]["model"]
+    content["device"] |= {"volume": file} | change
+
 
 BAD: list[tuple[Change, str]] = [
     (lambda c: c.update(sied="left"), r"case\.yaml, sied: unknown key"),
@@ -133,6 +152,16 @@ BAD: list[tuple[Change, str]] = [
     (lambda c: c["device"].update(hu="steel"), r"device\.hu: a number was expected, found 'steel'"),
     (lambda c: c["device"].update(hu=True), r"device\.hu: a number was expected"),
     (lambda c: c["device"].update(model="no.stl"), r"device\.model: there is no file"),
+    (lambda c: c["device"].pop("model"), r"device\.model: is missing"),
+    (lambda c: c["device"].update(model="labels.nii.gz"), r"device\.model: a mesh .*labels\.nii\.gz.*`volume`"),
+    (lambda c: c["device"].update(volume="labels.nii.gz"), r"device\.volume: `model` \(a mesh\) is given too"),
+    (lambda c: c["device"].update(labels=[1]), r"device\.labels: only a `volume` has labels"),
+    (lambda c: as_volume(c, "device.stl", labels=[1]), r"device\.volume: a volume .*device\.stl.*`model`"),
+    (lambda c: as_volume(c, "no.nrrd", labels=[1]), r"device\.volume: there is no file"),
+    (lambda c: as_volume(c, "labels.nii.gz", labels=[0]), r"device\.labels: a list of label ids .*found \[0\]"),
+    (lambda c: as_volume(c, "labels.nii.gz", labels=3), r"device\.labels: a list of label ids .*found 3"),
+    (lambda c: as_volume(c, "labels.nii.gz", labels=[1], hu=None), r"device\.hu: is missing"),
+    (lambda c: as_volume(c, "labels.nii.gz"), r"device\.hu: a `volume` without `labels` holds HU"),
     (lambda c: c["device"]["points"].pop("base"), r"device\.points\.base: is missing"),
     (lambda c: c["device"]["points"].update(top=[0, 0, 0]), r"device\.points\.top: unknown key"),
     (lambda c: c["device"]["points"].update(tip=c["device"]["points"]["base"]), r"points\.tip: tip and base are"),

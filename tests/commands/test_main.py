@@ -179,7 +179,18 @@ def test_the_installed_overview_is_quick_and_complete() -> None:
     start = time.perf_counter()
     done = subprocess.run([FEMOREG, "--help"], capture_output=True, encoding="utf-8", check=True)
     assert time.perf_counter() - start < 2  # 0.15 s on an idle machine: no command is imported
-    for name in ("demo", "detect", "evaluate", "navigate", "phantom", "register", "replay", "simulate", "train"):
+    for name in (
+        "dataset",
+        "demo",
+        "detect",
+        "evaluate",
+        "navigate",
+        "phantom",
+        "register",
+        "replay",
+        "simulate",
+        "train",
+    ):
         (line,) = (line for line in done.stdout.splitlines() if line.startswith(f"  {name} "))
         assert len(line.split()) > 3
         assert "not installed" not in line

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from torch.testing import assert_close
 
 from femoreg_torch.detect import decode_heatmaps, detect, load_network, network_camera
+from femoreg_torch.detect.looks import PLAIN
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, invert_rigid, load_carm, project_points, rotation_angle, transform_points
 from femoreg_torch.pnp import solve_pnp
@@ -65,7 +66,7 @@ def test_planted_landmarks_give_the_pose(image: Tensor) -> None:
     truth = project_points(CAMERA, transform_points(CAMERA_FROM_LPS, POINTS))
     visible = ((truth > 0) & (truth < 1535)).all(1)
     assert 8 <= visible.sum() < 14
-    detection = detect(Planted(planted(truth, visible), True), image, CAMERA)
+    detection = detect(Planted(planted(truth, visible), True), image, CAMERA, PLAIN)
     assert not detection.turned
     assert detection.visible.equal(visible)
     assert_close(detection.pixels[visible], truth[visible], atol=0.7, rtol=0)  # 0.04 pixels of the heat map
@@ -79,7 +80,7 @@ def test_planted_landmarks_give_the_pose(image: Tensor) -> None:
 def test_an_image_on_its_head_is_read_turned(image: Tensor) -> None:
     truth = project_points(CAMERA, transform_points(CAMERA_FROM_LPS, POINTS))
     visible = ((truth > 0) & (truth < 1535)).all(1)
-    detection = detect(Planted(planted(truth, visible), True), image.rot90(2), CAMERA)
+    detection = detect(Planted(planted(truth, visible), True), image.rot90(2), CAMERA, PLAIN)
     assert detection.turned
     assert_close(detection.pixels[visible], 1535 - truth[visible], atol=0.7, rtol=0)
     assert detection.segmentation[:, 90].argmax(0).eq(5).all()
@@ -87,7 +88,7 @@ def test_an_image_on_its_head_is_read_turned(image: Tensor) -> None:
 
 
 def test_the_segmentations_camera(image: Tensor) -> None:
-    detection = detect(Planted(planted(torch.full((14, 2), 700.0), torch.ones(14).bool()), True), image, CAMERA)
+    detection = detect(Planted(planted(torch.full((14, 2), 700.0), torch.ones(14).bool()), True), image, CAMERA, PLAIN)
     assert detection.segmentation.shape == (7, *detection.network_camera.shape)
     assert detection.network_camera == network_camera(CAMERA).downsampled(2)
     assert_close(detection.segmentation.sum(0), torch.ones(96, 96))
@@ -115,5 +116,5 @@ def test_a_camera_of_other_pixels(image: Tensor) -> None:
     camera = Camera(1020.0, (0.388, 0.388), (768, 768), (383.5, 383.5))
     truth = project_points(CAMERA, transform_points(CAMERA_FROM_LPS, POINTS))
     visible = ((truth > 0) & (truth < 1535)).all(1)
-    detection = detect(Planted(planted(truth, visible), True), image[::2, ::2].contiguous(), camera)
+    detection = detect(Planted(planted(truth, visible), True), image[::2, ::2].contiguous(), camera, PLAIN)
     assert_close(detection.pixels[visible], (truth[visible] + 0.5) / 2 - 0.5, atol=0.4, rtol=0)

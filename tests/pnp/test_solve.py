@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import Camera, exp_so3, load_carm, rotation_angle
+from femoreg_torch.geometry import Camera, exp_so3, load_carm, log_so3, rotation_angle
 from femoreg_torch.pnp import PnpResult, solve_pnp
 
 AP_FROM_LPS = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
@@ -146,3 +146,63 @@ def test_shapes_and_values_are_checked() -> None:
         solve_pnp(PELVIS, pixels[:5], CAMERA)
     with pytest.raises(InputError, match="finite"):
         solve_pnp(PELVIS, pixels * torch.nan, CAMERA)
+
+
+def test_a_patient_on_the_tube_is_refused() -> None:
+    """Pose and landmarks agree, but nobody lies 350 mm from the source."""
+    with pytest.raises(InputError, match="too few usable landmarks"):
+        solve_pnp(PELVIS, seen(pose(depth_mm=350.0)), CAMERA)
+
+
+def trial(rng: np.random.Generator, deviations_px: Tensor) -> tuple[Tensor, Tensor]:
+    """A random pose, and its landmarks off by normal deviates of `deviations_px` (14,)."""
+    truth = pose(tuple(rng.uniform(-15, 15, 3)), rng.uniform(650, 800))
+    noise = torch.from_numpy(rng.normal(size=(14, 2))) * deviations_px[:, None]
+    return truth, seen(truth) + noise
+
+
+def test_known_deviations_are_better_than_none() -> None:
+    rng = np.random.default_rng(7)
+    deviations = torch.tensor([1.0, 6.0] * 7).double() / 0.194
+    errors = []
+    for _ in range(10):
+        truth, pixels = trial(rng, deviations)
+        poses = [solve_pnp(PELVIS, pixels, CAMERA, None, given).camera_from_object for given in (None, deviations)]
+        errors.append([rotation_angle(found[:3, :3] @ truth[:3, :3].mT).item() for found in poses])
+    without, known = np.median(errors, axis=0)
+    assert known < 0.8 * without
+
+
+def test_the_posterior_covariance_covers_the_truth() -> None:
+    """The squared error in units of the covariance has the mean of chi squared with six degrees of freedom."""
+    rng = np.random.default_rng(11)
+    deviations = torch.full((14,), 2.0 / 0.194, dtype=torch.float64)
+    middle = PELVIS.mean(0)
+    distances = []
+    for _ in range(25):
+        truth, pixels = trial(rng, deviations)
+        result = solve_pnp(PELVIS, pixels, CAMERA, None, deviations)
+        found = result.camera_from_object
+        turn = log_so3(truth[:3, :3] @ found[:3, :3].mT)
+        shift = (truth[:3, :3] @ middle + truth[:3, 3]) - (found[:3, :3] @ middle + found[:3, 3])
+        error = torch.cat([turn, shift])
+        distances.append((error @ torch.linalg.solve(result.covariance, error)).item())
+    assert 3.8 < np.mean(distances) < 9
+
+
+def test_a_gross_outlier_counts_little() -> None:
+    rng = np.random.default_rng(2)
+    deviations = torch.full((14,), 2.0 / 0.194, dtype=torch.float64)
+    truth, pixels = trial(rng, deviations)
+    pixels[4] += 300.0
+    assert_pose(solve_pnp(PELVIS, pixels, CAMERA, None, deviations), truth, 3.0, 4.0, 30.0)
+
+
+def test_a_rotation_left_open_is_refused() -> None:
+    """Four landmarks about one hip, known to 6 mm: they agree on a pose, but on many others too."""
+    pixels = seen(pose((5, 5, 0)))
+    few = torch.tensor([0, 2, 4, 6])
+    deviations = torch.full((4,), 6.0 / 0.194, dtype=torch.float64)
+    assert solve_pnp(PELVIS[few], pixels[few], CAMERA).inliers.all()
+    with pytest.raises(InputError, match=r"too few usable landmarks: .* fix the rotation only to"):
+        solve_pnp(PELVIS[few], pixels[few], CAMERA, None, deviations)

@@ -9,12 +9,12 @@ from torch import Tensor
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import CArm, about_point, centred_camera, exp_se3, rigid, rotation_angle
 from femoreg_torch.registration import Poses, Scene
-from femoreg_torch.registration.scene import Kind
+from femoreg_torch.registration.scene import Kind, RigidObject, Segmentation
 from femoreg_torch.volume import Volume, axis_aligned
 
 CARM = CArm(centred_camera(1020.0, (3.0, 3.0), (88, 88)), (0.0, 0.0, 632.0), (0.0, 1.0, 0.0))
 VOXEL_MM = 3.0
-VIEW_ANGLES_DEG = (0.0, 10.0, -15.0)
+VIEW_ANGLES_DEG = (0.0, 10.0, -15.0, 22.0)
 
 
 def float64(*values: float) -> Tensor:
@@ -39,20 +39,22 @@ VOLUMES = {
     "femur": bone(2, (36, 20, 18), 0.06, (70, 0, 20)),  # in the same space: one CT holds both
     "device": bone(3, (12, 12, 30), 0.2),
 }
+CLASSES = {"pelvis": (1, 2), "femur": (3,)}  # of a segmentation with four classes
 REFERENCE_POINTS = {"pelvis": float64(0, 0, 0), "femur": float64(64, 0, -20), "device": float64(0, 0, 0)}
 
 
-def true_poses() -> Poses:
+def true_poses(views: tuple[int, ...] = (0, 1, 2)) -> Poses:
     """Pelvis and femur 740 mm from the source, the device in front of them; views a little off the orbit."""
     off_orbit = [
         rigid(),
         exp_se3(float64(0.004, -0.005, 0.004, 1, -0.8, 3)),
         exp_se3(float64(-0.004, 0.004, -0.006, -0.5, 1, -3)),
+        exp_se3(float64(0.005, 0.003, 0.002, 1, -1, 2)),
     ]
     orbit = CARM.orbit(float64(*VIEW_ANGLES_DEG) * math.pi / 180)
     pelvis = exp_se3(float64(0.1, -0.2, 0.05, 0, 0, 0)) + _shift(-24, -8, 740)
     return Poses(
-        torch.stack([extra @ turn for extra, turn in zip(off_orbit, orbit, strict=True)]),
+        torch.stack([off_orbit[view] @ orbit[view] for view in views]),
         {
             "pelvis": pelvis,
             "femur": off(pelvis, REFERENCE_POINTS["femur"], (6, -5, 8), (0, 0, 0)),
@@ -75,8 +77,14 @@ def line_integrals(poses: Poses, view: int, names: tuple[str, ...]) -> Tensor:
     return torch.nn.functional.avg_pool2d(total[None, None], 4)[0, 0]
 
 
-def make_scene(poses: Poses, seed: int = 0, with_device: bool = True, noise: float = 0.003) -> Scene:
-    """Noisy images of all views with all objects at `poses`."""
+def make_scene(
+    poses: Poses,
+    seed: int = 0,
+    with_device: bool = True,
+    noise: float = 0.003,
+    camera1_from_device: Tensor | None = None,
+) -> Scene:
+    """Noisy images of all views with all objects at `poses`; the device starts at its own unless told otherwise."""
     generator = torch.Generator().manual_seed(seed)
 
     def image(view: int, names: tuple[str, ...]) -> Tensor:
@@ -87,7 +95,30 @@ def make_scene(poses: Poses, seed: int = 0, with_device: bool = True, noise: flo
     images: dict[Kind, tuple[Tensor, ...]] = {"anatomy": tuple(image(v, ("pelvis", "femur")) for v in views)}
     if with_device:
         images["device"] = tuple(image(v, ("pelvis", "femur", "device")) for v in views)
-    return Scene(CARM, VOLUMES, REFERENCE_POINTS, images)
+    always: tuple[Kind, ...] = ("anatomy", "device")
+    objects = {
+        name: RigidObject(VOLUMES[name], REFERENCE_POINTS[name], always, classes=classes)
+        for name, classes in CLASSES.items()
+    }
+    start = poses.camera1_from["device"] if camera1_from_device is None else camera1_from_device
+    objects["device"] = RigidObject(VOLUMES["device"], REFERENCE_POINTS["device"], ("device",), start)
+    return Scene(CARM, objects, images)
+
+
+def segmentations(poses: Poses) -> tuple[Segmentation, ...]:
+    """What a faultless network sees in every view, on a coarser grid: background, two halves of the pelvis, femur."""
+    camera = CARM.camera.downsampled(2)
+    left = torch.arange(camera.shape[1]) < camera.shape[1] // 2
+
+    def seen(view: int) -> Segmentation:
+        pelvis, femur = (
+            torch.nn.functional.max_pool2d(line_integrals(poses, view, (name,))[None], 2)[0] > 0.01
+            for name in ("pelvis", "femur")
+        )
+        labels = torch.where(femur, 3, torch.where(pelvis, torch.where(left, 1, 2), 0))
+        return Segmentation(torch.nn.functional.one_hot(labels, 4).movedim(-1, 0).float(), camera)
+
+    return tuple(seen(view) for view in range(len(poses.camera_from_camera1)))
 
 
 def off(pose: Tensor, point: Tensor, rotation_deg: tuple[float, ...], translation_mm: tuple[float, ...]) -> Tensor:

@@ -1,21 +1,24 @@
 """Slope and curvature of a stage's objective, against finite differences of its values."""
 
 import math
+from dataclasses import replace
 
+import pytest
 import torch
-from registration_scenes import REFERENCE_POINTS, float64, make_scene, off, true_poses
+from registration_scenes import REFERENCE_POINTS, float64, make_scene, off, segmentations, true_poses
 
 from femoreg_torch.registration.objective import Level, Prior, image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, reference_point_in_view
+from femoreg_torch.registration.weights import Weighting
 
 _LEVEL = Level(downsample=1, step_mm=2.0, patch_radius=5)
 _SCALE = float64(*[math.radians(1)] * 3, 1.0, 1.0, 4.0)
 
 
-def _joint_objective(prior: Prior | None = None):  # type: ignore[no-untyped-def]
+def _joint_objective(prior: Prior | None = None, weights: tuple[Weighting, ...] = ()):  # type: ignore[no-untyped-def]
     """Every object and every C-arm but the first free, a little off the truth."""
     poses = true_poses()
-    scene = make_scene(poses)
+    scene = replace(make_scene(poses), segmentations=segmentations(poses))
     for name, point in REFERENCE_POINTS.items():
         poses = poses.with_object(name, off(poses.camera1_from[name], point, (0.5, -0.4, 0.6), (0.5, 0.4, -2)))
     objects = tuple(
@@ -23,12 +26,15 @@ def _joint_objective(prior: Prior | None = None):  # type: ignore[no-untyped-def
     )
     views = tuple(Body((), v, reference_point_in_view(scene, poses, "pelvis", v), _SCALE) for v in (1, 2))
     images = [(kind, view) for kind in ("anatomy", "device") for view in range(3)]
-    costs = image_costs(scene, poses, (*objects, *views), tuple(REFERENCE_POINTS), images, _LEVEL)
+    costs = image_costs(scene, poses, (*objects, *views), tuple(REFERENCE_POINTS), images, _LEVEL, weights)
     return stage_objective(costs, (*objects, *views), prior)
 
 
-def test_the_gradient_is_the_slope_of_the_values_and_the_curvature_is_never_negative() -> None:
-    objective = _joint_objective(Prior(rotation_deg=5, translation_mm=10, weight=0.1))
+@pytest.mark.parametrize("weights", [(), ("bones",)])
+def test_the_gradient_is_the_slope_of_the_values_and_the_curvature_is_never_negative(
+    weights: tuple[Weighting, ...],
+) -> None:
+    objective = _joint_objective(Prior(rotation_deg=5, translation_mm=10, weight=0.1), weights)
     delta = 0.3 * torch.randn(30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     model = objective.quadratic(delta)
     h = 0.02

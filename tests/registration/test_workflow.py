@@ -1,14 +1,17 @@
 """Stages and whole plans recover known poses; the laws that bodies and stages obey."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from registration_scenes import REFERENCE_POINTS, error, float64, make_scene, off, true_poses
 
+from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import rotation_angle, transform_points
-from femoreg_torch.optimize import Bobyqa, CmaEs
+from femoreg_torch.optimize import Bobyqa, CmaEs, LevenbergMarquardt
 from femoreg_torch.registration import Plan, Poses, Scene, run_plan
+from femoreg_torch.registration.covariance import pose_covariance
 from femoreg_torch.registration.objective import Level, Prior, image_costs, stage_objective
 from femoreg_torch.registration.plan import BodyPlan, OrbitSearch, Stage
 from femoreg_torch.registration.scene import Body, first_view_only, moved
@@ -94,10 +97,11 @@ def test_a_known_offset_is_recovered_from_all_views(scene: Scene) -> None:
     assert deg < 0.15
 
 
-def test_a_whole_plan_finds_every_pose(scene: Scene) -> None:
+def test_a_whole_plan_finds_every_pose() -> None:
     start = started()
     starts_with = off(TRUTH.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"], (2, -2, 1), (3, -4, 12))
-    outcome = run_plan(scene, PLAN, starts_with, start.camera1_from["device"], seed=1, report=lambda *_: None)
+    scene = make_scene(TRUTH, camera1_from_device=start.camera1_from["device"])
+    outcome = run_plan(scene, PLAN, starts_with, seed=1, report=lambda *_: None)
     for name, true in TRUTH.camera1_from.items():
         found = outcome.poses.camera1_from[name]
         point = torch.cat([REFERENCE_POINTS[name], float64(1)])
@@ -121,9 +125,103 @@ def test_same_seed_same_poses_bit_for_bit(scene: Scene) -> None:
 def test_steps_of_the_device_are_left_out_where_it_has_no_images() -> None:
     without = make_scene(TRUTH, with_device=False)
     plan = Plan("test", (pelvis_stage(Bobyqa(max_evaluations=15)), PLAN.steps[-1]))
-    outcome = run_plan(without, plan, TRUTH.camera1_from["pelvis"], float64(*[1] * 16).view(4, 4), 0, lambda *_: None)
+    outcome = run_plan(without, plan, TRUTH.camera1_from["pelvis"], 0, lambda *_: None)
     assert [entry.name for entry in outcome.trace] == ["pelvis"]
     assert "device" not in outcome.poses.camera1_from
+
+
+def test_bones_start_where_the_ct_has_them_and_others_at_their_nominal_pose(scene: Scene) -> None:
+    camera1_from_ct = TRUTH.camera1_from["femur"]
+    start = scene.start(camera1_from_ct)
+    assert list(start.camera1_from) == ["pelvis", "femur", "device"]
+    assert all(torch.equal(start.camera1_from[name], camera1_from_ct) for name in ("pelvis", "femur"))
+    assert torch.equal(start.camera1_from["device"], TRUTH.camera1_from["device"])
+    assert torch.equal(start.camera_from_camera1, torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        OrbitSearch("odd", ["pelvis", "tibia"], 30, 1, LEVEL),
+        Stage("odd", "all", ["anatomy"], ["tibia"], [], LEVEL, Bobyqa()),
+        Stage(
+            "odd", "all", ["anatomy"], ["pelvis"], [BodyPlan(["tibia"], "pelvis", [1] * 3, [1] * 3)], LEVEL, Bobyqa()
+        ),
+        Stage(
+            "odd", "all", ["anatomy"], ["pelvis"], [BodyPlan(["pelvis"], "tibia", [1] * 3, [1] * 3)], LEVEL, Bobyqa()
+        ),
+    ],
+)
+def test_an_object_that_the_scene_lacks_is_named_before_anything_runs(scene: Scene, step: Stage | OrbitSearch) -> None:
+    told: list[str] = []
+    says = "^registration preset mine, step “odd”: .* no object “tibia”; there are: pelvis, femur, device.$"
+    with pytest.raises(InputError, match=says):
+        run_plan(
+            scene, Plan("mine", (*PLAN.steps, step)), TRUTH.camera1_from["pelvis"], 0, lambda name, _: told.append(name)
+        )
+    assert not told
+
+
+def refinement(names: dict[str, str], search_deg: float = 30) -> Plan:
+    """Everything by Levenberg–Marquardt; the objects are called as `names` says."""
+    pelvis, femur, device = (names[name] for name in ("pelvis", "femur", "device"))
+    settings = LevenbergMarquardt(max_iterations=8, tol_x=1e-3, tol_f=1e-7)
+    views = BodyPlan(["views"], pelvis, [1, 1, 1], [1, 1, 5])
+    bones = [
+        BodyPlan([pelvis, femur], pelvis, [2, 2, 2], [2, 2, 10]),
+        BodyPlan([femur], femur, [2, 2, 2], [0, 0, 0]),
+    ]
+    every = [*bones, BodyPlan([device], device, [1, 1, 1], [1, 1, 4]), views]
+    return Plan(
+        "refinement",
+        (
+            Stage("bones", "first", ["anatomy"], [pelvis, femur], bones, LEVEL, settings),
+            OrbitSearch("orbit", [pelvis, femur], search_deg, 1, LEVEL),
+            Stage("C-arms", "all", ["anatomy"], [pelvis, femur], [views], LEVEL, settings),
+            Stage("everything", "all", ["anatomy", "device"], [pelvis, femur, device], every, LEVEL, settings),
+        ),
+    )
+
+
+@pytest.mark.parametrize(("views", "most_mm"), [((0,), 6.0), ((0, 2), 1.0), ((0, 1, 2, 3), 0.5)])
+def test_any_number_of_views_from_one_upwards(views: tuple[int, ...], most_mm: float) -> None:
+    """One view leaves millimetres of depth; every other error stays small."""
+    truth = true_poses(views)
+    point = REFERENCE_POINTS["device"]
+    scene = make_scene(truth, camera1_from_device=off(truth.camera1_from["device"], point, (1, -1, 1), (1, 1, -2)))
+    start = off(truth.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"], (1, -1, 1), (1, -1, 6))
+    plan = refinement({name: name for name in REFERENCE_POINTS})
+    outcome = run_plan(scene, plan, start, seed=0, report=lambda *_: None)
+    for name, true in truth.camera1_from.items():
+        found = outcome.poses.camera1_from[name]
+        x, y, depth = ((found - true) @ torch.cat([REFERENCE_POINTS[name], float64(1)]))[:3].abs().tolist()
+        assert max(x, y) < 0.3, name
+        assert depth < most_mm, name
+        assert error(found, true, REFERENCE_POINTS[name])[1] < 0.7, name
+    assert len(outcome.poses.camera_from_camera1) == len(views)
+    turns = outcome.poses.camera_from_camera1[:, :3, :3] @ truth.camera_from_camera1[:, :3, :3].mT
+    assert max(math.degrees(float(rotation_angle(turn))) for turn in turns) < 0.3
+    other_views = [f"view {view + 1}" for view in range(1, len(views))]
+    assert pose_covariance(scene, outcome.poses, LEVEL).bodies == (*truth.camera1_from, *other_views)
+    orbits = [("orbit", view) for view in range(1, len(views))]
+    c_arms = [("C-arms", None)] if len(views) > 1 else []
+    told = [(entry.name, entry.view) for entry in outcome.trace]
+    assert told == [("bones", None), *orbits, *c_arms, ("everything", None)]
+
+
+def test_objects_may_have_any_name() -> None:
+    names = {"pelvis": "scapula", "femur": "humerus", "device": "nail"}
+    truth = true_poses((0, 2))
+    scene = make_scene(truth)
+    renamed = replace(scene, objects={names[name]: thing for name, thing in scene.objects.items()})
+    start = off(truth.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"], (1, 0, 0), (1, 0, 3))
+    usual, other = (
+        run_plan(here, refinement(called, 16), start, seed=0, report=lambda *_: None).poses
+        for here, called in ((scene, {name: name for name in names}), (renamed, names))
+    )
+    assert list(other.camera1_from) == list(names.values())
+    for name, called in names.items():
+        assert torch.equal(usual.camera1_from[name], other.camera1_from[called])
 
 
 def test_rotation_only_keeps_the_centre(scene: Scene) -> None:

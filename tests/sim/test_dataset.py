@@ -57,7 +57,7 @@ def ball(centre: Tensor) -> Volume:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_landmarks_lie_where_a_bright_ball_is_seen(layers: Layers, seed: int) -> None:
-    ranges = ViewRanges(shift_mm=5.0, one_hip_share=0.0, depth_mm=(800.0, 850.0))
+    ranges = ViewRanges(shift_mm=5.0, one_hip_share=0.0, cranial_share=0.0, depth_mm=(800.0, 850.0))
     pose = sample_pose(ranges, layers.landmarks, np.random.default_rng(seed))
     view = render_view(layers, pose, CAMERA)
     axis = torch.arange(192, dtype=torch.float32)
@@ -66,6 +66,18 @@ def test_landmarks_lie_where_a_bright_ball_is_seen(layers: Layers, seed: int) ->
         image = image.flip(-1) if pose.mirrored else image
         seen = torch.stack([(image.sum(0) * axis).sum(), (image.sum(1) * axis).sum()]) / image.sum()
         assert_close(seen, view.landmarks[n], atol=0.06, rtol=0)
+
+
+def test_cranial_views_move_the_heads_to_the_lower_edge(layers: Layers) -> None:
+    heads = [HIP_LANDMARKS.index(name) for name in ("FH-l", "FH-r")]
+    rows = []
+    for share in (0.0, 1.0):
+        ranges = ViewRanges(shift_mm=0.0, one_hip_share=0.0, cranial_share=share, cranial_mm=(80.0, 80.0))
+        pose = sample_pose(ranges, layers.landmarks, np.random.default_rng(4))
+        middle = transform_points(pose.camera_from_lps, layers.landmarks[heads]).mean(0)
+        rows.append(float(middle[1]))
+    assert abs(rows[0]) < 1e-6
+    assert abs(rows[1] - 80.0) < 1e-6
 
 
 def test_left_is_on_the_right_and_the_head_is_up(layers: Layers) -> None:

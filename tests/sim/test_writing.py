@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from femoreg_torch.case import read_case, write_case
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import read_image
-from femoreg_torch.volume import read_ct, read_labels, read_mesh
+from femoreg_torch.fluoro import attenuation_image, read_image
+from femoreg_torch.volume import Volume, read_ct, read_labels, read_mesh, write_volume
 from sim.commands import phantom, simulate
 from sim.writing import SIMULATION_STEPS, write_simulation
 
@@ -82,3 +83,30 @@ def test_bad_input_leaves_nothing_behind(patient, tmp_path):
     with pytest.raises(InputError, match=r"ct\.nii\.gz"):
         simulate(tmp_path, out=tmp_path / "case")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_images_may_come_from_a_finer_scan_of_the_same_patient(patient, simulated, tmp_path):
+    """The case keeps the coarse CT and the truth; only the images differ, and not by much."""
+    finer = tmp_path / "finer"
+    phantom(finer, seed=2, side="right", spacing_mm=1.5)
+    write_simulation(patient, tmp_path / "case", 5, None, "paper", lambda _: None, finer)
+    case, coarse = read_case(tmp_path / "case"), read_case(simulated)
+    assert read_ct(case.ct_path).spacing_mm == pytest.approx((2.0, 2.0, 2.0))
+    assert torch.equal(case.truth.camera_from_pelvis, coarse.truth.camera_from_pelvis)
+    one, other = (attenuation_image(read_image(known.views[0].anatomy)) for known in (case, coarse))
+    assert not torch.equal(one, other)
+    assert np.corrcoef(one.flatten(), other.flatten())[0, 1] > 0.99
+
+
+def test_a_finer_scan_of_somebody_else_is_refused(patient, tmp_path):
+    finer = tmp_path / "finer"
+    ct = read_ct(patient / "ct.nii.gz")
+    moved = ct.lps_from_index.clone()
+    moved[0, 3] += 7
+    labels = read_labels(patient / "labels.nii.gz", ct)
+    finer.mkdir()
+    write_volume(finer / "ct.nii.gz", Volume(ct.data, moved))
+    write_volume(finer / "labels.nii.gz", Volume(labels.data, moved))
+    with pytest.raises(InputError, match=r"7\.0 mm elsewhere"):
+        write_simulation(patient, tmp_path / "case", 5, None, "paper", lambda _: None, finer)
+    assert not (tmp_path / "case").exists()

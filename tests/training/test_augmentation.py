@@ -64,7 +64,7 @@ def test_a_move_takes_image_labels_and_landmarks_along() -> None:
 
 
 def test_layers_add_up() -> None:
-    plain = AugmentationSettings(tissue=(0.5, 0.5), bone=(2.0, 2.0), bone_spread=0.0, unevenness=0.0)
+    plain = AugmentationSettings(tissue=(0.5, 0.5), bone=(2.0, 2.0), bone_spread=0.0, unevenness=0.0, gas=0.0)
     bones = torch.zeros(1, 6, 8, 8)
     bones[0, 2] = 0.25
     bones[0, 5] = 0.5

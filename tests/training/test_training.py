@@ -1,6 +1,7 @@
 """Learning on a CPU in seconds: one batch by heart, and one run from a case folder to exported weights."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,10 +10,13 @@ import torch
 from femoreg_torch.detect import load_network
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume import HIP_LANDMARKS, Volume, axis_aligned, write_landmarks, write_volume
+from models.build import make_network
 from models.losses import multi_task_loss
 from models.unet import UNet, UNetConfig
+from models.weights import save_weights
 from training.commands import train
 from training.data import ViewBatches
+from training.run import _begin_with
 from training.settings import read_settings
 
 SETTINGS = """
@@ -118,9 +122,28 @@ def test_bad_settings(settings: Path, tmp_path: Path) -> None:
         train(settings, out=tmp_path / "run", resume=True)
 
 
-@pytest.mark.parametrize("name", ["quick", "hip14"])
+CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "training"
+
+
+@pytest.mark.parametrize("name", [path.relative_to(CONFIGS).as_posix() for path in sorted(CONFIGS.rglob("*.yaml"))])
 def test_the_shipped_settings(name: str) -> None:
-    path = Path(__file__).resolve().parents[2] / "configs" / "training" / f"{name}.yaml"
-    settings = read_settings(path, ["optimisation.epochs=3"])
+    settings = read_settings(CONFIGS / name, ["optimisation.epochs=3"])
     assert settings.optimisation.epochs == 3
     assert not set(settings.cohort.patient_seeds) & set(settings.cohort.validation_seeds)
+    with torch.device("meta"):
+        parameters = sum(parameter.numel() for parameter in make_network(settings.network).parameters())
+    assert parameters < 8.5e6
+
+
+def test_a_deeper_network_begins_as_the_shallower_one(settings: Path, tmp_path: Path) -> None:
+    """Residual blocks are the identity at first: training from weights that lack them starts where these ended."""
+    shallow = read_settings(settings).network
+    torch.manual_seed(5)
+    network = UNet(shallow).eval()
+    save_weights(tmp_path / "shallow.safetensors", network, {})
+    deep = UNet(replace(shallow, residual=(1, 0, 2))).eval()
+    _begin_with(tmp_path / "shallow.safetensors", deep)
+    image = torch.randn(1, 1, 64, 64)
+    torch.testing.assert_close(deep(image).heatmaps, network(image).heatmaps)
+    with pytest.raises(InputError, match="these weights are of"):
+        _begin_with(tmp_path / "shallow.safetensors", UNet(UNetConfig(channels=(8, 12, 24), convolutions=(1, 1, 1))))

@@ -1,0 +1,91 @@
+"""Pixel weights of an image: which pixels a stage's similarity looks at."""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.drr import project
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import Camera, project_points
+from femoreg_torch.registration.scene import Kind, Poses, Scene, Segmentation
+
+# bones: the objects that the stage draws, where the network sees them. What the network does not know (an instrument)
+# counts where it is drawn at its present pose.
+# clear: nothing behind an instrument that the stage does not move. Instruments are what the anatomy images do not hold.
+Weighting = Literal["bones", "clear"]
+
+# On the detector. All chosen here: the segmentation errs by a few mm, and a gradient patch needs both sides of an edge;
+# an instrument that has its place has it within 1 mm.
+_BONE_MARGIN_MM = 10.0
+_SHADOW_MARGIN_MM = 3.0
+_LEAST_PROBABILITY = 0.5
+_LEAST_SHADOW = 0.02  # line integral: two per cent of the beam
+
+
+def pixel_weights(
+    scene: Scene,
+    poses: Poses,
+    render: Sequence[str],
+    moving: Sequence[str],
+    image: tuple[Kind, int],
+    camera: Camera,
+    step_mm: float,
+    weights: Sequence[Weighting],
+) -> Tensor | None:
+    """Weights (H, W), 0 or 1, of an image (kind, view) on the grid of `camera`; None where all pixels count alike.
+
+    `render` names what the stage draws, `moving` the objects that it moves in camera 1. Raises `InputError` if no pixel
+    is left, or for `bones` in a scene without segmentations.
+    """
+    if not weights:
+        return None
+    kind, view = image
+    looked_at = torch.ones(camera.shape, dtype=torch.bool)
+    if "bones" in weights:
+        looked_at &= _bones(scene, poses, scene.shown(render, kind), view, camera, step_mm)
+    if "clear" in weights:
+        placed = scene.shown(poses.camera1_from, kind)
+        still = [name for name in placed if "anatomy" not in scene.objects[name].shown_in and name not in moving]
+        looked_at &= ~_dilated(_silhouette(scene, poses, still, view, camera, step_mm), _SHADOW_MARGIN_MM, camera)
+    if not looked_at.any():
+        raise InputError(
+            f"view {view + 1}, {kind} image: weights [{', '.join(weights)}] leave no pixel to compare. Does it show "
+            f"{', '.join(render)}? Otherwise take `weights` out of the stage."
+        )
+    return looked_at.float()
+
+
+def _bones(scene: Scene, poses: Poses, names: Sequence[str], view: int, camera: Camera, step_mm: float) -> Tensor:
+    """The pixels (H, W) near the named objects."""
+    if not scene.segmentations:
+        raise InputError("weights [bones]: the scene has no segmentations. Add them with `with_segmentations`.")
+    classes = sorted({label for name in names for label in scene.objects[name].classes})
+    seen = _on_grid(scene.segmentations[view], camera)[classes].sum(0) >= _LEAST_PROBABILITY
+    unknown = [name for name in names if not scene.objects[name].classes]
+    return _dilated(seen | _silhouette(scene, poses, unknown, view, camera, step_mm), _BONE_MARGIN_MM, camera)
+
+
+def _on_grid(segmentation: Segmentation, camera: Camera) -> Tensor:
+    """Probabilities (C, H, W) on the grid of another camera with the same detector; zero beyond the border."""
+    pixels = project_points(segmentation.camera, camera.pixel_positions())
+    size = torch.tensor(segmentation.camera.shape[::-1], dtype=torch.float64)
+    unit = ((2 * pixels + 1) / size - 1).to(segmentation.probabilities.dtype)  # pixel centres to grid_sample's −1 … 1
+    return F.grid_sample(segmentation.probabilities[None], unit[None], align_corners=False)[0]
+
+
+def _silhouette(scene: Scene, poses: Poses, names: Sequence[str], view: int, camera: Camera, step_mm: float) -> Tensor:
+    """The pixels (H, W) that the named objects cover at `poses`."""
+    if not names:
+        return torch.zeros(camera.shape, dtype=torch.bool)
+    where = torch.stack([poses.camera_from(name)[view] for name in names])[None]
+    return project([scene.objects[name].volume for name in names], where, camera, step_mm)[0] > _LEAST_SHADOW
+
+
+def _dilated(mask: Tensor, margin_mm: float, camera: Camera) -> Tensor:
+    """The pixels (H, W) that are closer than a margin on the detector, along rows and columns, to those of a mask."""
+    rows, columns = (math.ceil(margin_mm / pixel_mm) for pixel_mm in camera.pixel_mm)
+    return F.max_pool2d(mask[None].float(), (2 * rows + 1, 2 * columns + 1), 1, (rows, columns))[0] > 0

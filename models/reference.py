@@ -1,0 +1,67 @@
+"""The network of Grupp et al. (IJCARS 15, 2020) for comparison: a six-level U-Net with residual blocks.
+
+Blocks of two 3 × 3 convolutions, each followed by ReLU and then batch normalisation, beside a 1 × 1 convolution of the
+block's input; down by 2 × 2 convolutions of stride 2, up by transposed ones. The landmark head takes the features and
+the class logits through two 1 × 1 convolutions with nothing between them. Three things differ, so that it is trained,
+read and measured as `models.unet` is: logits are averaged over 2 × 2 pixels; heat maps are logits of a distribution;
+and that distribution has a learned constant for "not in the image", which the original leaves to a test on the heat map.
+"""
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from models.unet import Prediction, UNetConfig
+
+_HIDDEN = 21  # width between the landmark head's two convolutions
+
+
+class _Block(nn.Module):
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        layers = []
+        for first in (inputs, outputs):
+            layers += [nn.Conv2d(first, outputs, 3, padding=1), nn.ReLU(inplace=True), nn.BatchNorm2d(outputs)]
+        self.body = nn.Sequential(*layers)
+        self.shortcut = nn.Conv2d(inputs, outputs, 1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        return self.body(features) + self.shortcut(features)
+
+
+class ReferenceUNet(nn.Module):
+    """Takes images (B, 1, H, W) of mean 0 and deviation 1 each; H and W are multiples of 2^(levels − 1).
+
+    Of the configuration, `channels` per level (32, 64, … 1024 in the paper), `classes` and `landmarks` count.
+    """
+
+    def __init__(self, config: UNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        widths = config.channels
+        self.encoder = nn.ModuleList(_Block(*sizes) for sizes in pairwise((1, *widths)))
+        self.down = nn.ModuleList(nn.Conv2d(width, width, 2, stride=2) for width in widths[:-1])
+        self.up = nn.ModuleList(nn.ConvTranspose2d(b, a, 2, stride=2) for a, b in pairwise(widths))
+        self.decoder = nn.ModuleList(_Block(2 * width, width) for width in widths[:-1])
+        self.segmentation = nn.Conv2d(widths[0], config.classes, 1, bias=False)
+        self.heatmaps = nn.Sequential(
+            nn.Conv2d(widths[0] + config.classes, _HIDDEN, 1, bias=False),
+            nn.Conv2d(_HIDDEN, config.landmarks, 1, bias=False),
+        )
+        self.absence = nn.Parameter(torch.zeros(config.landmarks))
+
+    def forward(self, image: Tensor) -> Prediction:
+        skips = []
+        features = image
+        for depth, block in enumerate(self.encoder):
+            features = block(self.down[depth - 1](features) if depth else features)
+            skips.append(features)
+        features = skips.pop()
+        for up, decode in zip(reversed(self.up), reversed(self.decoder), strict=True):
+            features = decode(torch.cat([skips.pop(), up(features)], 1))
+        segmentation = self.segmentation(features)
+        heatmaps = self.heatmaps(torch.cat([features, segmentation], 1))
+        absence = self.absence.expand(len(image), -1)
+        return Prediction(F.avg_pool2d(segmentation, 2), F.avg_pool2d(heatmaps, 2), absence)

@@ -1,0 +1,168 @@
+"""Simulated images in the layout of the public DeepFluoro data set, so that what reads the one reads the other.
+
+The layout is that of its preprocessed files, `ipcai_2020_ds_8x.h5` and so on (README of
+rg2/DeepFluoroLabeling-IPCAI2020):
+
+    land-names/num-lands      14
+    land-names/land-00 …      names, in the order of HIP_LANDMARKS
+    NN/projs  (N, R, C) float32    attenuation, bone bright, head up; 01, 02, … are the patients
+    NN/segs   (N, R, C) uint8      labels 0 to 6
+    NN/lands  (N, 2, 14) float32   columns, then rows; may lie outside of the image
+
+There, images lose 50 pixels at each border and then keep every s-th point: pixel u of a file is pixel 50 + s u of the
+detector, without the half pixel by which an average over s × s pixels would be moved.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import temporary_file
+from femoreg_torch.fluoro import attenuation_image
+from femoreg_torch.geometry import Camera, load_carm
+from femoreg_torch.volume import HIP_LANDMARKS, read_ct, read_labels, read_landmarks
+from sim.labelled_views import (
+    Anatomy,
+    LabelledSettings,
+    PhysicsView,
+    labelled_settings,
+    make_devices,
+    prepare_anatomy,
+    render_physics,
+)
+from sim.patient import make_patient
+from sim.settings import read_settings, record, section
+
+_BORDER_PX = 50  # of the detector, cut off on every side
+_ARRAYS = ("projs", "segs", "lands")
+_COMPRESSION = 9  # of gzip, as in the public files
+
+
+@dataclass(frozen=True)
+class Cohort:
+    """Who is imaged, and how often."""
+
+    seeds: tuple[int, ...]  # procedural patients
+    spacing_mm: float  # of their CTs
+    folders: tuple[str, ...]  # with ct.nii.gz, labels.nii.gz and landmarks.json
+    views: int  # of each patient
+    seed: int
+
+
+@dataclass(frozen=True)
+class LabelledSet:
+    """The images of one patient; shapes as in the file."""
+
+    projs: Tensor
+    segs: Tensor
+    lands: Tensor
+
+
+def deepfluoro_camera(camera: Camera, factor: int) -> Camera:
+    """The camera of the file's images: every `factor`-th pixel between the borders that are cut off."""
+    rows, columns = (round((n - 2 * _BORDER_PX) / factor) for n in camera.shape)
+    if min(rows, columns) < 1:
+        raise InputError(f"image, binning: {factor} leaves no pixel of a {camera.shape} detector.")
+    spans = [slice(_BORDER_PX, _BORDER_PX + (n - 1) * factor + 1, factor) for n in (rows, columns)]
+    return camera.window(*spans)
+
+
+def write_dataset(config: str, out: Path, report: Callable[[str], None]) -> None:
+    """Render the data set of a preset or YAML file into the HDF5 file `out`, whole or not at all.
+
+    `report` is told each patient before it is imaged. Raises `InputError` for settings that do not fit.
+    """
+    settings = read_settings(config)
+    where = f"labelled images {config}"
+    labelled = labelled_settings(settings, where)
+    patients = {
+        name: tuple(v) if isinstance(v, list) else v for name, v in section(settings, "patients", where).items()
+    }
+    cohort = record(Cohort, patients, f"{where}, patients")
+    camera = deepfluoro_camera(load_carm("cios_fusion").camera, labelled.binning)
+    sources: list[tuple[str, Callable[[], Anatomy]]] = [
+        (f"procedural patient {seed}", partial(_procedural, seed, cohort.spacing_mm)) for seed in cohort.seeds
+    ]
+    sources += [(folder, partial(_from_folder, Path(folder))) for folder in cohort.folders]
+    if not sources:
+        raise InputError(f"{where}, patients: neither `seeds` nor `folders` name a patient.")
+    with temporary_file(out) as part, h5py.File(part, "w") as file:
+        _write_names(file)
+        for number, (source, make) in enumerate(sources, 1):
+            report(source)
+            seed = (cohort.seed, number)
+            _write_patient(file.create_group(f"{number:02d}"), make(), labelled, camera, cohort.views, seed, source)
+
+
+def _procedural(seed: int, spacing_mm: float) -> Anatomy:
+    patient = make_patient(seed, spacing_mm)
+    return prepare_anatomy(patient.ct, patient.labels, patient.landmarks)
+
+
+def _from_folder(folder: Path) -> Anatomy:
+    ct = read_ct(folder / "ct.nii.gz")
+    return prepare_anatomy(ct, read_labels(folder / "labels.nii.gz", ct), read_landmarks(folder / "landmarks.json"))
+
+
+def _write_names(file: h5py.File) -> None:
+    names = file.create_group("land-names")
+    names["num-lands"] = len(HIP_LANDMARKS)
+    for n, name in enumerate(HIP_LANDMARKS):
+        names[f"land-{n:02d}"] = name
+
+
+def _write_patient(
+    group: h5py.Group,
+    anatomy: Anatomy,
+    settings: LabelledSettings,
+    camera: Camera,
+    count: int,
+    seed: tuple[int, int],
+    source: str,
+) -> None:
+    """Render and write view by view, so that no more than one is held."""
+    group.attrs["source"] = f"simulated: {source}"
+    options: Mapping[str, Any] = {"compression": "gzip", "compression_opts": _COMPRESSION}
+    shape, one = (count, *camera.shape), (1, *camera.shape)
+    projs = group.create_dataset("projs", shape, np.float32, chunks=one, **options)
+    segs = group.create_dataset("segs", shape, np.uint8, chunks=one, **options)
+    lands = group.create_dataset("lands", (count, 2, len(HIP_LANDMARKS)), np.float32)
+    rng = np.random.default_rng(seed)
+    noise = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    devices = make_devices(settings)
+    for n in range(count):
+        view: PhysicsView = render_physics(anatomy, settings, camera, camera, devices, rng, noise)
+        projs[n] = attenuation_image(view.image.float()).numpy()
+        segs[n] = view.labels.numpy()
+        lands[n] = view.landmarks.T.numpy()
+
+
+def read_dataset(path: Path, patients: Sequence[str] | None = None) -> dict[str, LabelledSet]:
+    """Patients `NN` of a file in this layout, simulated or public; all where `patients` is None.
+
+    Raises `InputError` if the file is missing, is something else, or names other landmarks than HIP_LANDMARKS.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    try:
+        with h5py.File(path, "r") as file:
+            _check_names(file, path)
+            chosen = patients or sorted(name for name in file if name != "land-names")
+            return {name: LabelledSet(*(torch.from_numpy(file[name][k][()]) for k in _ARRAYS)) for name in chosen}
+    except (OSError, KeyError) as error:
+        raise InputError(f"{path}: cannot be read as a data set in the DeepFluoro layout ({error}).") from error
+
+
+def _check_names(file: h5py.File, path: Path) -> None:
+    names = file["land-names"]
+    found = tuple(names[f"land-{n:02d}"][()].decode() for n in range(int(names["num-lands"][()])))
+    if found != tuple(HIP_LANDMARKS):
+        raise InputError(f"{path}: holds the landmarks {', '.join(found)}; expected {', '.join(HIP_LANDMARKS)}.")

@@ -1,0 +1,185 @@
+"""`python -m sim.study COMMAND …`: the measurements behind `docs/accuracy.md`; see the Makefile."""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from jsonargparse import auto_cli
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.registration import load_plan
+from sim.study import ablation as variants
+from sim.study import accuracy as measurement
+from sim.study import capture
+from sim.study.cases import Stores, ready
+from sim.study.procedures import Procedure, Study, load_study, procedures
+from sim.study.timing import time_register
+
+_DATA = Path(os.environ.get("FEMOREG_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+_OUT = Path("out/accuracy")
+Kind = Literal["all", "procedural", "real"]
+
+
+def cases(
+    first: int | None = None,
+    kind: Kind = "all",
+    out: Path = _OUT,
+    patients: Path | None = None,
+    data: Path = _DATA,
+    jobs: int = 1,
+) -> None:
+    """Make the simulated procedures, and keep them; those that are there stay as they are.
+
+    Args:
+        first: only the first so many.
+        kind: patients to take.
+        out: folder that holds, or will hold, `cases/`.
+        patients: CTs around real bone shapes; OUT/patients if not given.
+        data: real bone shapes; the environment's FEMOREG_DATA, if set.
+        jobs: cases made at the same time, on one core each; a case needs some gigabytes of memory.
+    """
+    study, chosen, stores = _chosen(first, kind, out, patients, data)
+    measurement.make_cases(chosen, study, stores, jobs)
+
+
+def accuracy(
+    preset: str = "fast",
+    first: int | None = None,
+    kind: Kind = "all",
+    out: Path = _OUT,
+    patients: Path | None = None,
+    data: Path = _DATA,
+    jobs: int = 1,
+    reuse: bool = False,
+    timed: int = 0,
+    docs: Path | None = None,
+) -> None:
+    """Register the simulated procedures, making those that are missing, and tell the errors.
+
+    Args:
+        preset: registration preset.
+        first: only the first so many procedures; of the preset `paper` 20, of all others all, if not given.
+        kind: patients to take.
+        out: folder of cases and results.
+        patients: CTs around real bone shapes; OUT/patients if not given.
+        data: real bone shapes; the environment's FEMOREG_DATA, if set.
+        jobs: registrations at the same time, on one core each; one alone may use all cores.
+        reuse: take results that are there although code or plan have changed since (those of the same code always are).
+        timed: time the whole command `femoreg register` on so many of the procedures, one after the other.
+        docs: folder of the page that is to be renewed.
+    """
+    first = 20 if first is None and preset == "paper" else first
+    study, chosen, stores = _chosen(first, kind, out, patients, data)
+    measurement.make_cases(chosen, study, stores, jobs)
+    plan = load_plan(preset)
+    folder = out / preset
+    records = measurement.register_all(chosen, study, stores, plan, folder / "runs", jobs, reuse)
+    timing = time_register([stores.case(p) for p in chosen[:timed]], preset) if timed else None
+    print(measurement.write_results(records, len(procedures(study)), preset, folder, docs, timing))
+
+
+def capture_range(
+    preset: str = "fast",
+    first: int = 4,
+    starts: int = 24,
+    kind: Kind = "all",
+    out: Path = _OUT,
+    patients: Path | None = None,
+    data: Path = _DATA,
+    docs: Path | None = None,
+) -> None:
+    """Success of the pelvis stages in view 1 against the offset of the start.
+
+    Args:
+        preset: registration preset.
+        first: procedures to start on.
+        starts: at every offset, over all procedures together.
+        kind: patients to take.
+        out: folder of cases and results.
+        patients: CTs around real bone shapes; OUT/patients if not given.
+        data: real bone shapes; the environment's FEMOREG_DATA, if set.
+        docs: folder of the page that is to be renewed.
+    """
+    study, chosen, stores = _chosen(first, kind, out, patients, data)
+    measurement.make_cases(chosen, study, stores, 1)
+    plan = load_plan(preset)
+    records = capture.sweep_starts([stores.case(p) for p in chosen], plan, starts)
+    print(capture.write_capture(records, plan, out / "capture", docs))
+
+
+def ablation(
+    variants_file: Path = Path("configs/study/ablation.yaml"),
+    first: int = 8,
+    kind: Kind = "all",
+    out: Path = _OUT,
+    patients: Path | None = None,
+    data: Path = _DATA,
+    jobs: int = 1,
+    docs: Path | None = None,
+) -> None:
+    """Variants of a plan on the same procedures, in one table.
+
+    Args:
+        variants_file: YAML file of variants.
+        first: procedures to take.
+        kind: patients to take.
+        out: folder of cases and results.
+        patients: CTs around real bone shapes; OUT/patients if not given.
+        data: real bone shapes; the environment's FEMOREG_DATA, if set.
+        jobs: registrations at the same time, on one core each.
+        docs: folder of the page that is to be renewed.
+    """
+    study, chosen, stores = _chosen(first, kind, out, patients, data)
+    measurement.make_cases(chosen, study, stores, jobs)
+    rows = []
+    for variant in variants.read_variants(variants_file):
+        runs = out / "ablation" / variant.name.replace(" ", "_")
+        plan = variants.plan_of(variant)
+        print(variant.name, flush=True)
+        records = measurement.register_all(chosen, study, stores, plan, runs, jobs, views=variant.views)
+        rows.append(variants.row_of(variant, records))
+    print(variants.write_ablation(rows, len(chosen), variants_file, docs))
+
+
+def listing(first: int | None = None, kind: Kind = "all", out: Path = _OUT) -> None:
+    """Which procedures the study has, and which of their cases are there.
+
+    Args:
+        first: only the first so many.
+        kind: patients to take.
+        out: folder of cases.
+    """
+    study, chosen, stores = _chosen(first, kind, out, None, _DATA)
+    for procedure in chosen:
+        print(f"{'ready' if ready(procedure, study, stores) else '-----'}  {stores.case(procedure)}")
+
+
+def _chosen(
+    first: int | None, kind: Kind, out: Path, patients: Path | None, data: Path
+) -> tuple[Study, list[Procedure], Stores]:
+    study = load_study("accuracy")
+    fitting = [p for p in procedures(study) if kind in ("all", "procedural" if p.procedural else "real")]
+    return study, fitting[:first], Stores(out / "cases", patients or out / "patients", data)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; bad input is told in one line, with exit status 2."""
+    commands: dict[str, Any] = {
+        "accuracy": accuracy,
+        "cases": cases,
+        "capture-range": capture_range,
+        "ablation": ablation,
+        "list": listing,
+    }
+    try:
+        auto_cli(commands, args=None if arguments is None else list(arguments), as_positional=False)
+    except InputError as error:
+        print(f"sim.study: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

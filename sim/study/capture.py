@@ -1,0 +1,150 @@
+"""How far off the pelvis may start: success of the first view's stages against rotation, depth and shift."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.case import Truth, read_case
+from femoreg_torch.errors import InputError
+from femoreg_torch.evaluation import errors, reference_points
+from femoreg_torch.files import write_json
+from femoreg_torch.geometry import about_point, exp_so3, rigid, transform_points
+from femoreg_torch.registration import Plan, prepare_scene, run_plan
+from femoreg_torch.registration.plan import Stage
+from sim.study import figures
+from sim.study.page import machine, table, write_section
+
+SUCCESS_MM, SUCCESS_DEG = 10.0, 2.0  # one view leaves millimetres of depth; the stages after it settle them
+FULL = {"rotation": 30.0, "depth": 100.0, "lateral": 40.0}  # degrees, mm, mm
+LEVELS = (0.2, 0.4, 0.6, 0.8, 1.0)  # shares of these, singly and, as `jointly`, all at once
+AXIS_LABELS = {
+    "rotation": "rotation, °",
+    "depth": "depth, mm",
+    "lateral": "shift in the image plane, mm",
+    "jointly": "% of 30°, 100 mm and 40 mm",
+}
+
+
+@dataclass(frozen=True)
+class Offset:
+    """How far a start lies from the truth."""
+
+    rotation_deg: float
+    depth_mm: float
+    lateral_mm: float
+
+
+def offset(sweep: str, share: float) -> Offset:
+    """The offset of one sweep at a share of its full size."""
+    size = {name: share * full if sweep in (name, "jointly") else 0.0 for name, full in FULL.items()}
+    return Offset(size["rotation"], size["depth"], size["lateral"])
+
+
+def displaced(camera1_from_pelvis: Tensor, centre: Tensor, by: Offset, generator: torch.Generator) -> Tensor:
+    """A start pose (4, 4): turned about `centre` (3,) of the pelvis (mm, LPS) and shifted, in camera axes.
+
+    The axis of rotation is uniform on the sphere, the shift's direction uniform in the image plane, the change of depth
+    as often towards the source as away from it.
+    """
+    axis = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+    angle, sign = torch.rand(2, generator=generator, dtype=torch.float64)
+    along = 2 * torch.pi * angle
+    depth = by.depth_mm * (1.0 if sign < 0.5 else -1.0)
+    shift = torch.stack([by.lateral_mm * along.cos(), by.lateral_mm * along.sin(), torch.as_tensor(depth).double()])
+    turn = rigid(exp_so3(torch.deg2rad(torch.tensor(by.rotation_deg, dtype=torch.float64)) * axis))
+    middle = transform_points(camera1_from_pelvis, centre[None])[0]
+    return rigid(translation=shift) @ about_point(turn, middle) @ camera1_from_pelvis
+
+
+def first_stages(plan: Plan) -> Plan:
+    """The stages of a plan before it looks at any view but the first. Raises `InputError` if there are none."""
+    steps = tuple(takewhile(lambda step: isinstance(step, Stage) and step.images == "first", plan.steps))
+    if not steps:
+        raise InputError(f"registration preset {plan.preset}: its first step looks at other views than the first.")
+    return replace(plan, steps=steps)
+
+
+def sweep_starts(cases: Sequence[Path], plan: Plan, starts: int) -> list[dict[str, Any]]:
+    """One record per start: `starts` of them at every level of every sweep, spread evenly over the cases.
+
+    A record holds sweep, share, case, the offset and the errors of the pelvis afterwards.
+    """
+    plan = first_stages(plan)
+    records = []
+    for number, folder in enumerate(cases):
+        case = read_case(folder)
+        if case.truth is None:
+            raise InputError(f"{folder}: has no truth to start from.")
+        one_view = replace(case, views=case.views[:1])
+        scene = prepare_scene(one_view)
+        points = reference_points(case)
+        true = case.truth.camera_from_pelvis[:1]
+        truth = Truth(true, case.truth.camera1_from_femur)
+        for sweep in AXIS_LABELS:
+            for level, share in enumerate((0.0, *LEVELS)):
+                if share == 0 and sweep != "rotation":
+                    continue  # the truth is the same start in every sweep
+                by = offset(sweep, share)
+                for start in range(number, starts, len(cases)):
+                    generator = torch.Generator().manual_seed(1000 * level + start)
+                    pose = displaced(true[0], scene.objects["pelvis"].reference_point, by, generator)
+                    poses = run_plan(scene, plan, pose, start, lambda *_: None).poses
+                    found = Truth(poses.camera_from("pelvis")[:1], poses.camera1_from["femur"])
+                    row = errors(truth, found, points)["pelvis"]
+                    records.append({"sweep": sweep, "share": share, "case": folder.name, **asdict(by), "pelvis": row})
+            print(f"{folder.name}: {sweep} done", flush=True)
+    return records
+
+
+def succeeded(record: dict[str, Any]) -> bool:
+    """Whether the pelvis came within 10 mm and 2° of the truth."""
+    return record["pelvis"]["mm"] <= SUCCESS_MM and record["pelvis"]["deg"] <= SUCCESS_DEG
+
+
+def success_rates(records: Sequence[dict[str, Any]]) -> dict[str, list[tuple[float, int, int]]]:
+    """(offset, successes, starts) of every level of every sweep; each begins with the starts at the truth."""
+    rates: dict[str, list[tuple[float, int, int]]] = {}
+    for sweep in AXIS_LABELS:
+        rates[sweep] = []
+        for share in (0.0, *LEVELS):
+            here = [r for r in records if r["share"] == share and (r["sweep"] == sweep or share == 0)]
+            if here:
+                rates[sweep].append((share * FULL.get(sweep, 100.0), sum(map(succeeded, here)), len(here)))
+    return rates
+
+
+def write_capture(records: Sequence[dict[str, Any]], plan: Plan, out: Path, docs: Path | None) -> str:
+    """Write records and figure into `out`, and a section with the figure into `docs`, if given. Returns the section."""
+    out.mkdir(parents=True, exist_ok=True)
+    rates = success_rates(records)
+    names = ", ".join(f"“{step.name}”" for step in first_stages(plan).steps)
+    cases = sorted({record["case"] for record in records})
+    figure = figures.capture_figure(rates, AXIS_LABELS, f"Capture range of the pelvis in view 1, `{plan.preset}`")
+    for folder in (out, *([docs] if docs else [])):
+        figures.save(figure, folder / f"capture_{plan.preset}.png")
+    write_json(out / f"capture_{plan.preset}.json", {"preset": plan.preset, "starts": list(records)})
+    rows = [
+        [sweep, *(f"{value:g}: {good} of {starts}" for value, good, starts in points)]
+        for sweep, points in rates.items()
+    ]
+    text = "\n\n".join(
+        [
+            f"`make capture-range PRESET={plan.preset}`: the stages of the first view ({names}) from starts off the "
+            f"truth, on {len(cases)} simulated procedures. Success: the middle of the pelvis within {SUCCESS_MM:g} mm "
+            f"and its rotation within {SUCCESS_DEG:g}° afterwards; the femur starts as the CT has it. Shaded: 95 % "
+            "interval.",
+            f"![Success rate against start offset](capture_{plan.preset}.png)",
+            table(("offset: successes", *([""] * (len(LEVELS) + 1))), rows),
+            f"Jointly: % of {FULL['rotation']:g}°, {FULL['depth']:g} mm and {FULL['lateral']:g} mm at once. "
+            f"Measured on: {machine()}",
+        ]
+    )
+    if docs:
+        write_section(docs, f"Capture range: `{plan.preset}`", text)
+    return text

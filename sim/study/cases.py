@@ -1,0 +1,107 @@
+"""The case folders of a study, made once and kept: the images depend on nothing but the procedure and the settings."""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from femoreg_torch.configs import load_preset
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import plain, read_json, write_json
+from sim.study.procedures import Procedure, Study
+from sim.writing import write_procedural_simulation, write_simulation
+
+# Voxels of the CT in the case, and of those that the images are made from.
+REGISTERED_MM = 1.0
+PROCEDURAL_IMAGED_MM = 0.75
+REAL_IMAGED_MM = 0.5
+_ORIGIN = "study.json"
+
+
+@dataclass(frozen=True)
+class Stores:
+    """Folders that a study reads from and writes to."""
+
+    cases: Path
+    patients: Path  # CTs built around real bone shapes
+    data: Path  # meshes of real bones; beside it, `tools` with make_ct.py
+
+    def case(self, procedure: Procedure) -> Path:
+        """Where the case of a procedure stands."""
+        return self.cases / procedure.name
+
+
+def ready(procedure: Procedure, study: Study, stores: Stores) -> bool:
+    """Whether the case of a procedure is there. Raises `InputError` if it was made with other settings."""
+    path = stores.case(procedure) / _ORIGIN
+    if not path.is_file():
+        return False
+    if read_json(path) != _origin(procedure, study):
+        raise InputError(f"{path.parent}: was made with other settings than those of this study. Remove it.")
+    return True
+
+
+def _origin(procedure: Procedure, study: Study) -> dict[str, Any]:
+    settings = load_preset("simulation", study.acquisition)
+    voxels = (REGISTERED_MM, PROCEDURAL_IMAGED_MM if procedure.procedural else REAL_IMAGED_MM)
+    return plain({"procedure": asdict(procedure), "voxels_mm": voxels, "simulation": settings})
+
+
+def make_case(procedure: Procedure, study: Study, stores: Stores, report: Callable[[str], None]) -> None:
+    """Make the case of a procedure, unless it is there."""
+    if ready(procedure, study, stores):
+        return
+    folder, origin = stores.case(procedure), _origin(procedure, study)
+    shutil.rmtree(folder, ignore_errors=True)  # what an interrupted run left
+    stores.cases.mkdir(parents=True, exist_ok=True)
+    if procedure.procedural:
+        spacings = (REGISTERED_MM, PROCEDURAL_IMAGED_MM)
+        patient = int(procedure.patient)
+        write_procedural_simulation(
+            folder, patient, procedure.seed, procedure.side, study.acquisition, report, spacings
+        )
+    else:
+        patient_folder, finer = (
+            subject_folder(procedure.patient, mm, stores) for mm in (REGISTERED_MM, REAL_IMAGED_MM)
+        )
+        write_simulation(patient_folder, folder, procedure.seed, procedure.side, study.acquisition, report, finer)
+    write_json(folder / _ORIGIN, origin)
+
+
+def make_case_alone(procedure: Procedure, study: Study, stores: Stores) -> None:
+    """The same in a process of its own, on one core and without a word."""
+    torch.set_num_threads(1)
+    make_case(procedure, study, stores, lambda _: None)
+
+
+def subject_folder(subject: str, spacing_mm: float, stores: Stores) -> Path:
+    """CT, labels and landmarks around the bones of a subject, made unless they are there.
+
+    Raises `InputError` if the meshes or the tool that builds the CT are missing, or the tool fails.
+    """
+    folder = stores.patients / subject / f"{spacing_mm:.1f}"
+    if folder.is_dir():
+        return folder
+    tool, mesh = stores.data.parent / "tools" / "make_ct.py", stores.data / "meshes" / f"{subject}.npz"
+    for path in (tool, mesh):
+        if not path.is_file():
+            raise InputError(
+                f"{path}: there is no such file. Set FEMOREG_DATA to the folder of the real bone shapes, or measure on "
+                "procedural patients only (--kind procedural)."
+            )
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as part:
+        built = Path(part) / "patient"
+        command = [sys.executable, str(tool), "--subject", subject, "--out", str(built), "--spacing", str(spacing_mm)]
+        done = subprocess.run(command, capture_output=True, encoding="utf-8")
+        if done.returncode:
+            last = (done.stderr.strip() or "no word").splitlines()[-1]
+            raise InputError(f"{tool}: failed for {subject} ({last}). It needs the extra `study`.")
+        built.replace(folder)
+    return folder

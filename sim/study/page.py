@@ -1,0 +1,51 @@
+"""`docs/accuracy.md`: sections of Markdown, each replaced as a whole when it is measured anew."""
+
+import os
+import platform
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+from femoreg_torch.files import write_text
+
+PAGE = "accuracy.md"
+_HEAD = """# Accuracy
+
+Every figure on this page was written by the command named above it, and comes from **simulated** fluoroscopy:
+procedural patients (computed shapes), and CTs with invented grey values around real bone shapes (*real*). It says
+nothing about patients. The paper's figures beside them are means over 1,000 simulations of another anatomy in another
+simulator (Gao et al., IEEE Trans Med Robot Bionics 2 (2020) 437, Tables I and II)."""
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table, first column to the left, all others to the right."""
+    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def number(value: float, digits: int = 2) -> str:
+    """For a table: – for what is not known, ∞ for what no pose was found for."""
+    if value != value:
+        return "–"
+    return "∞" if value == float("inf") else f"{value:.{digits}f}"
+
+
+def write_section(docs: Path, title: str, text: str) -> None:
+    """Put a section into the page in the folder `docs`, in place of an older one of the same title."""
+    path = docs / PAGE
+    before = path.read_text(encoding="utf-8").rstrip() if path.is_file() else _HEAD
+    head, *sections = before.split("\n## ")
+    kept = {section.split("\n", 1)[0]: section.rstrip() for section in sections}
+    kept[title] = f"{title}\n\n{text}".rstrip()
+    docs.mkdir(parents=True, exist_ok=True)
+    write_text(path, "\n\n## ".join([head.rstrip(), *kept.values()]) + "\n")
+
+
+def machine() -> str:
+    """One line: processor, cores, load, versions."""
+    cpus = Path("/proc/cpuinfo")
+    names = cpus.read_text(encoding="utf-8").splitlines() if cpus.is_file() else []
+    model = next((line.split(":")[1].strip() for line in names if line.startswith("model name")), platform.processor())
+    found = ", ".join(f"{package} {version(package)}" for package in ("torch", "numba"))
+    load = f"load average {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    return f"{model}, {os.cpu_count()} cores, {load}; Python {platform.python_version()}, {found}."

@@ -1,0 +1,65 @@
+"""Which procedures a study consists of."""
+
+from dataclasses import dataclass
+
+from femoreg_torch.configs import load_preset
+
+from femoreg_torch.case.model import Side
+from sim.study.detections import DetectionNoise
+
+
+@dataclass(frozen=True)
+class Study:
+    """Settings of a study; their meaning is told in `configs/study/accuracy.yaml`."""
+
+    subjects: list[str]
+    per_subject: int
+    first_patient: int
+    patients: int
+    first_seed: int
+    acquisition: str
+    detections: DetectionNoise
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """One simulated procedure of a study."""
+
+    number: int  # from 1
+    patient: str  # name of a subject, or the seed of a procedural patient
+    side: Side
+    seed: int
+
+    @property
+    def procedural(self) -> bool:
+        """Whether the patient is computed from a seed, rather than built around real bone shapes."""
+        return self.patient.isdigit()
+
+    @property
+    def name(self) -> str:
+        """Unique among the procedures of a study; serves as the name of its folder."""
+        return f"{self.number:02d}_{self.patient}_{self.side}"
+
+
+def load_study(name: str) -> Study:
+    """Settings `configs/study/<name>.yaml`."""
+    content = load_preset("study", name)
+    return Study(**(content | {"detections": DetectionNoise(**content["detections"])}))
+
+
+def procedures(study: Study) -> list[Procedure]:
+    """All procedures, so ordered that any first few of them hold both kinds of patient, all subjects and both sides.
+
+    Procedural patients and subjects take turns while both last; the subjects follow one another in rounds, and change
+    sides from round to round.
+    """
+    sides: tuple[Side, Side] = ("left", "right")
+    count = len(study.subjects)
+    procedural = [(str(study.first_patient + n), sides[n % 2]) for n in range(study.patients)]
+    real = [
+        (study.subjects[n % count], sides[(1 + n % count + n // count) % 2]) for n in range(count * study.per_subject)
+    ]
+    shared = min(len(procedural), len(real))
+    turns = [patient for pair in zip(procedural, real, strict=False) for patient in pair]
+    turns += procedural[shared:] + real[shared:]
+    return [Procedure(n + 1, patient, side, study.first_seed + n) for n, (patient, side) in enumerate(turns)]

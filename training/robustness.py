@@ -1,0 +1,66 @@
+"""What becomes of the start pose when an image is not as it should be: a good start, a refusal, or a silent failure."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import torch
+
+from training.measure import COARSE, LabelledImage, Reading
+
+_NARROW = 0.55  # share of the image's width that a crop to one hip leaves
+
+
+def turned(image: LabelledImage) -> LabelledImage:
+    """The image on its head; the patient's pose is turned about the central ray with it."""
+    rows, columns = image.camera.shape
+    last = torch.tensor([columns - 1, rows - 1], dtype=image.landmarks.dtype)
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+    column, row = image.camera.principal_point_px
+    camera = replace(image.camera, principal_point_px=(columns - 1 - column, rows - 1 - row))
+    return replace(
+        image,
+        attenuation=image.attenuation.rot90(2),
+        landmarks=last - image.landmarks,
+        labels=image.labels.rot90(2),
+        camera=camera,
+        camera_from_lps=None if image.camera_from_lps is None else half_turn @ image.camera_from_lps,
+    )
+
+
+def inverted(image: LabelledImage) -> LabelledImage:
+    """Raw intensities inverted between their extremes before the logarithm, as by a wrong window of the display."""
+    raw = torch.exp(-image.attenuation.double())
+    exchanged = (raw.max() + raw.min() - raw).clamp_min(1e-3 * raw.max().item())
+    return replace(image, attenuation=-torch.log(exchanged).float())
+
+
+def cropped_to_one_hip(image: LabelledImage) -> LabelledImage:
+    """Shutters leave the side that shows more landmarks; what they cover is as dark as the densest part."""
+    columns = image.camera.shape[1]
+    keep = round(_NARROW * columns)
+    right = image.landmarks[image.visible, 0].median() > (columns - 1) / 2 if image.visible.any() else True
+    low = columns - keep if right else 0
+    covered = (torch.arange(columns) < low) | (torch.arange(columns) >= low + keep)
+    attenuation = image.attenuation.masked_fill(covered, image.attenuation.max().item())
+    hidden = (image.landmarks[:, 0] < low) | (image.landmarks[:, 0] >= low + keep)
+    factor = columns // image.labels.shape[1]
+    labels = image.labels.masked_fill(covered[::factor], 0)
+    return replace(image, attenuation=attenuation, labels=labels, visible=image.visible & ~hidden)
+
+
+VARIANTS: dict[str, Callable[[LabelledImage], LabelledImage]] = {
+    "as it is": lambda image: image,
+    "turned by 180°": turned,
+    "grey values inverted": inverted,
+    "cropped to one hip": cropped_to_one_hip,
+}
+
+
+def outcomes(readings: Iterable[Reading]) -> dict[str, int]:
+    """Numbers of good starts (within 10°, 20 mm, 100 mm), refusals and silent failures among the poses asked for."""
+    counted = {"good": 0, "refused": 0, "silent failure": 0}
+    for reading in readings:
+        if reading.asked:
+            good = bool((reading.pose_error < COARSE).all())
+            counted["refused" if reading.refused else "good" if good else "silent failure"] += 1
+    return counted
