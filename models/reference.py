@@ -4,7 +4,7 @@ Blocks of two 3 × 3 convolutions, each followed by ReLU and then batch normalis
 block's input; down by 2 × 2 convolutions of stride 2, up by transposed ones. The landmark head takes the features and
 the class logits through two 1 × 1 convolutions with nothing between them. Three things differ, so that it is trained,
 read and measured as `models.unet` is: logits are averaged over 2 × 2 pixels; heat maps are logits of a distribution;
-and that distribution has a learned constant for "not in the image", which the original leaves to a test on the heat map.
+and that distribution has a learned constant for "not in the image", which the original leaves to a test of the map.
 """
 
 from itertools import pairwise

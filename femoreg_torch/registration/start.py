@@ -21,8 +21,14 @@ Detector = Callable[[Tensor, Camera], Detection]  # finds the landmarks in an at
 def start_from_landmarks(case: Case, detection: Detection) -> tuple[Tensor, dict[str, Any]]:
     """`camera1_from_pelvis` (4, 4) from the landmarks that are seen in view 1, and what to keep of how it came.
 
-    Raises `InputError` if fewer than four landmarks are of use.
+    Raises `InputError` if fewer than four landmarks are of use, or if the grey values are inverted, which would mislead
+    the similarity even where the landmarks are found.
     """
+    if detection.inverted:
+        raise InputError(
+            f"{case.views[0].anatomy}: bone seems to be darker than soft tissue where it should be brighter. Set "
+            "`intensity` of the view (raw: bone dark, log: bone bright), or invert the picture."
+        )
     usable = [i for i, name in enumerate(HIP_LANDMARKS) if name in case.landmarks and bool(detection.visible[i])]
     if len(usable) < 4:
         raise InputError(
