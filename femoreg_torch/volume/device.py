@@ -15,7 +15,7 @@ from femoreg_torch.volume.reading import read_volume
 from femoreg_torch.volume.resample import crop, resample_isotropic
 
 _AIR_HU = -1000.0
-_EDGE_SIGMA = 0.5  # voxels; rounds the stairs of a label's edge, keeps its volume
+_EDGE_SIGMA = 0.35  # voxels; rounds the stairs of a label's edge, keeps its volume
 _MARGIN = 3  # empty voxels around a device: the reach of the Gaussian (truncated at four deviations), and one more
 _EMPTY_HU = -500.0  # half-way between air and water: below it a voxel counts as empty
 

@@ -23,7 +23,7 @@ from femoreg_torch.registration.scene import RigidObject
 from femoreg_torch.registration.workflow import run_stage
 from femoreg_torch.volume import voxelise_mesh
 
-LEVEL = Level(downsample=1, step_mm=1.0, patch_radius=4)
+LEVEL = Level(downsample=1, step_mm=0.5, patch_radius=4)
 TRUTH = true_poses()
 CENTRE = float64(10, 4, 40)
 BOXES = [((14, 14, 80), (7, 7, 40)), ((40, 10, 16), (20, 5, 20)), ((10, 30, 12), (6, 15, 60))]  # size and middle, mm
@@ -60,13 +60,15 @@ def test_a_labelled_volume_registers_as_the_mesh(tmp_path: Path) -> None:
     mesh, labels = as_mesh(tmp_path / "device.stl"), as_labels(tmp_path / "device.nii.gz")
     fine = voxelise_mesh(trimesh.load_mesh(mesh.model_path), 0.25, 5000.0)
     camera = centred_camera(1020.0, (1.5, 1.5), (176, 176))  # twice as fine as what is registered
+    true = TRUTH.camera1_from["device"].clone()
+    true[:3, 3] = float64(10, 12, 560) - true[:3, :3] @ CENTRE  # its middle is well within all images
+    placed = TRUTH.with_object("device", true)
     images = []
     for view in range(3):
-        where = torch.stack([TRUTH.camera_from(name)[view] for name in ("pelvis", "device")])[None]
+        where = torch.stack([placed.camera_from(name)[view] for name in ("pelvis", "device")])[None]
         image = project([VOLUMES["pelvis"], fine], where, camera, 0.25)
         images.append(torch.nn.functional.avg_pool2d(image[None], 2)[0, 0])
-    true = TRUTH.camera1_from["device"]
-    start = TRUTH.with_object("device", off(true, CENTRE, (3, -2, 2), (3, -2, 4)))
+    start = placed.with_object("device", off(true, CENTRE, (3, -2, 2), (3, -2, 4)))
     stage = Stage(
         "device",
         "all",
@@ -74,7 +76,7 @@ def test_a_labelled_volume_registers_as_the_mesh(tmp_path: Path) -> None:
         ["pelvis", "device"],
         [BodyPlan(["device"], "device", [2, 2, 2], [3, 3, 3])],
         LEVEL,
-        LevenbergMarquardt(max_iterations=12),
+        LevenbergMarquardt(max_iterations=20),
     )
     by_mesh, by_labels = (
         run_stage(scene_of(device, tuple(images)), start, stage, (0, 1, 2), seed=0).poses.camera1_from["device"]
@@ -82,11 +84,11 @@ def test_a_labelled_volume_registers_as_the_mesh(tmp_path: Path) -> None:
     )
     for found in (by_mesh, by_labels):
         mm, deg = error(found, true, CENTRE)
-        assert mm < 0.3
-        assert deg < 0.3
-    mm, deg = error(by_labels, by_mesh, CENTRE)
-    assert mm < 0.1
-    assert deg < 0.1
+        assert mm < 0.35
+        assert deg < 0.2
+    x, y, depth = ((by_labels - by_mesh) @ torch.cat([CENTRE, float64(1)]))[:3].abs().tolist()
+    assert max(x, y) < 0.1
+    assert depth < 0.5  # views 25° apart on pixels of 3 mm: either is that far from the truth in depth by itself
 
 
 def test_an_orbit_search_looks_at_the_kind_of_image_it_names() -> None:

@@ -171,7 +171,7 @@ def refinement(names: dict[str, str], search_deg: float = 30) -> Plan:
         BodyPlan([pelvis, femur], pelvis, [2, 2, 2], [2, 2, 10]),
         BodyPlan([femur], femur, [2, 2, 2], [0, 0, 0]),
     ]
-    every = [*bones, BodyPlan([device], device, [1, 1, 1], [1, 1, 4]), views]
+    every = [*(BodyPlan([name], name, [1, 1, 1], [1, 1, 4]) for name in (pelvis, femur, device)), views]
     return Plan(
         "refinement",
         (
@@ -183,9 +183,9 @@ def refinement(names: dict[str, str], search_deg: float = 30) -> Plan:
     )
 
 
-@pytest.mark.parametrize(("views", "most_mm"), [((0,), 6.0), ((0, 2), 1.0), ((0, 1, 2, 3), 0.5)])
-def test_any_number_of_views_from_one_upwards(views: tuple[int, ...], most_mm: float) -> None:
-    """One view leaves millimetres of depth; every other error stays small."""
+@pytest.mark.parametrize("views", [(0,), (0, 2), (0, 1, 2, 3)])
+def test_any_number_of_views_from_one_upwards(views: tuple[int, ...]) -> None:
+    """Depth follows from magnification alone, however many views of unknown geometry there are."""
     truth = true_poses(views)
     point = REFERENCE_POINTS["device"]
     scene = make_scene(truth, camera1_from_device=off(truth.camera1_from["device"], point, (1, -1, 1), (1, 1, -2)))
@@ -196,8 +196,8 @@ def test_any_number_of_views_from_one_upwards(views: tuple[int, ...], most_mm: f
         found = outcome.poses.camera1_from[name]
         x, y, depth = ((found - true) @ torch.cat([REFERENCE_POINTS[name], float64(1)]))[:3].abs().tolist()
         assert max(x, y) < 0.3, name
-        assert depth < most_mm, name
-        assert error(found, true, REFERENCE_POINTS[name])[1] < 0.7, name
+        assert depth < 2.0, name
+        assert error(found, true, REFERENCE_POINTS[name])[1] < 1.0, name
     assert len(outcome.poses.camera_from_camera1) == len(views)
     turns = outcome.poses.camera_from_camera1[:, :3, :3] @ truth.camera_from_camera1[:, :3, :3].mT
     assert max(math.degrees(float(rotation_angle(turn))) for turn in turns) < 0.3

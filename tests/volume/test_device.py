@@ -54,12 +54,15 @@ def drawn(volume: Volume) -> torch.Tensor:
     return project([volume], pose[None, None], CAMERA, 0.25)[0]
 
 
-@pytest.mark.parametrize(("spacing", "suffix"), [(0.5, "nii.gz"), (0.7, "nrrd"), (0.3, "mha")])
-def test_a_labelled_volume_is_drawn_as_the_mesh(tmp_path: Path, spacing: float, suffix: str) -> None:
+@pytest.mark.parametrize(
+    ("spacing", "suffix", "limit"), [(0.3, "mha", 0.04), (0.5, "nii.gz", 0.04), (0.7, "nrrd", 0.06)]
+)
+def test_a_labelled_volume_is_drawn_as_the_mesh(tmp_path: Path, spacing: float, suffix: str, limit: float) -> None:
+    """Hard labels know a wall of 3 mm to some half a voxel, so that coarse ones draw it less well."""
     write_voxels(tmp_path / f"device.{suffix}", spacing, 3, 1)
     expected = drawn(voxelise_mesh(mesh(), 0.25, HU))
     found = drawn(labelled_device(tmp_path / f"device.{suffix}", [3], HU, 0.5))
-    assert (found - expected).abs().sum() < 0.04 * expected.sum()
+    assert (found - expected).abs().sum() < limit * expected.sum()
     assert found.sum() == pytest.approx(float(expected.sum()), rel=0.02)
 
 
