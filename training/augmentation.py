@@ -15,10 +15,7 @@ from kornia.geometry.transform import warp_affine
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from femoreg_torch.detect import normalise
-
-_SWAPPED_LABELS = torch.tensor([0, 2, 1, 3, 4, 6, 5], dtype=torch.uint8)
-_SWAPPED_LANDMARKS = torch.arange(14).view(7, 2).flip(1).flatten()  # -l and -r stand in pairs
+from femoreg_torch.detect import MIRRORED_LABELS, MIRRORED_LANDMARKS, normalise
 
 
 @dataclass(frozen=True)
@@ -99,9 +96,9 @@ def flip_sides(images: Tensor, labels: Tensor, landmarks: Tensor) -> tuple[Tenso
 
     `landmarks` are in pixels of the images.
     """
-    swapped = landmarks[..., _SWAPPED_LANDMARKS, :].clone()
+    swapped = landmarks[..., MIRRORED_LANDMARKS, :].clone()
     swapped[..., 0] = images.shape[-1] - 1 - swapped[..., 0]
-    return images.flip(-1), _SWAPPED_LABELS[labels.flip(-1).long()], swapped
+    return images.flip(-1), MIRRORED_LABELS.to(torch.uint8)[labels.flip(-1).long()], swapped
 
 
 def inside(landmarks: Tensor, shape: tuple[int, int]) -> Tensor:

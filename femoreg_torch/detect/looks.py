@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 # Left and right change places in a mirror: landmarks stand in pairs, labels are 0 to 6 as in `sim.dataset`.
-_MIRRORED_LANDMARKS = torch.arange(14).view(7, 2).flip(1).flatten()
-_MIRRORED_LABELS = torch.tensor([0, 2, 1, 3, 4, 6, 5])
+MIRRORED_LANDMARKS = torch.arange(14).view(7, 2).flip(1).flatten()
+MIRRORED_LABELS = torch.tensor([0, 2, 1, 3, 4, 6, 5])
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,10 @@ def read_image(network: nn.Module, image: Tensor, looks: tuple[Look, ...]) -> Re
     absence = absence - total
     mirror = torch.tensor([look.mirrored for look in looks])
     heatmaps[mirror], absence[mirror] = (
-        heatmaps[mirror][:, _MIRRORED_LANDMARKS],
-        absence[mirror][:, _MIRRORED_LANDMARKS],
+        heatmaps[mirror][:, MIRRORED_LANDMARKS],
+        absence[mirror][:, MIRRORED_LANDMARKS],
     )
-    segmentation[mirror] = segmentation[mirror][:, _MIRRORED_LABELS]
+    segmentation[mirror] = segmentation[mirror][:, MIRRORED_LABELS]
     maps = torch.cat([segmentation, heatmaps], 1)
     undone = F.affine_grid(back, list(maps.shape), align_corners=False)
     maps = F.grid_sample(maps, undone, padding_mode="border", align_corners=False)

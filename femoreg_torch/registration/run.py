@@ -20,9 +20,8 @@ def register_case(case: Case, preset: str, seed: int, weights: Path | None, repo
     `weights` are those of the landmark network, None for those shipped. Raises `InputError` for input that does not
     fit.
     """
-    return register_by_plan(
-        case, load_plan(preset), seed, lambda image, camera: detect(load_network(weights), image, camera), report
-    )
+    plan, network = load_plan(preset), load_network(weights)
+    return register_by_plan(case, plan, seed, lambda image, camera: detect(network, image, camera), report)
 
 
 def register_by_plan(case: Case, plan: Plan, seed: int, find: Detector, report: Report) -> dict[str, Any]:

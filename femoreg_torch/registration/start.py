@@ -11,7 +11,7 @@ from femoreg_torch.case import Case
 from femoreg_torch.detect import Detection
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera
-from femoreg_torch.pnp import PnpResult, solve_pnp
+from femoreg_torch.pnp import MINIMUM, PnpResult, solve_pnp
 from femoreg_torch.registration.scene import Scene, Segmentation
 from femoreg_torch.volume import HIP_LANDMARKS
 
@@ -30,10 +30,10 @@ def start_from_landmarks(case: Case, detection: Detection) -> tuple[Tensor, dict
             "`intensity` of the view (raw: bone dark, log: bone bright), or invert the picture."
         )
     usable = [i for i, name in enumerate(HIP_LANDMARKS) if name in case.landmarks and bool(detection.visible[i])]
-    if len(usable) < 4:
+    if len(usable) < MINIMUM:
         raise InputError(
-            f"{case.views[0].anatomy}: {len(usable)} usable landmarks found, at least 4 are needed. Is this a hip, "
-            "and is `intensity` of the view right (raw: bone dark, log: bone bright)?"
+            f"{case.views[0].anatomy}: {len(usable)} usable landmarks found, at least {MINIMUM} are needed. Is this a "
+            "hip, and is `intensity` of the view right (raw: bone dark, log: bone bright)?"
         )
     points = torch.stack([case.landmarks[HIP_LANDMARKS[i]] for i in usable])
     seen = (detection.pixels[usable], case.carm.camera, detection.confidence[usable], detection.deviation_px[usable])
