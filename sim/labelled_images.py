@@ -10,6 +10,8 @@ There is one file (safetensors) per patient; for its N views it holds:
     camera_from_femur  (N, 2, 4, 4) float64      of the left and the right femur
     device             (N,) bool                 whether the device is in view
     one_hip            (N,) bool                 whether the view is aimed at one hip
+    hips               (D, H, W) uint8           share of a voxel inside the hip bones, 255 for all of it
+    lps_from_hips      (4, 4) float64            from that volume's (x, y, z) index to mm
     xray               (N, K) float64            what was drawn for tube and detector; `xray_names` says what
 """
 
@@ -26,10 +28,12 @@ from torch import Tensor
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera
+from femoreg_torch.volume import resample_isotropic
 from sim.labelled_views import Anatomy, LabelledSettings, make_devices, render_physics
 from sim.views import FEMUR_IDS
 from sim.xray import XrayModel
 
+_HIPS_MM = 2.5  # voxels of the hip bones that are kept with the images
 _TENSORS = (
     "images",
     "labels",
@@ -39,6 +43,8 @@ _TENSORS = (
     "camera_from_femur",
     "device",
     "one_hip",
+    "hips",
+    "lps_from_hips",
     "xray",
 )
 
@@ -55,6 +61,8 @@ class LabelledImages:
     camera_from_femur: Tensor
     device: Tensor
     one_hip: Tensor
+    hips: Tensor
+    lps_from_hips: Tensor
     xray: Tensor
     xray_names: tuple[str, ...]
     camera: Camera
@@ -77,6 +85,7 @@ def render_views(
     views = [
         render_physics(anatomy, settings, camera, camera.downsampled(2), devices, rng, noise) for _ in range(count)
     ]
+    hips = resample_isotropic(anatomy.masks[1].with_data(anatomy.masks[1].data + anatomy.masks[2].data), _HIPS_MM)
     return LabelledImages(
         images=torch.stack([view.image for view in views]),
         labels=torch.stack([view.labels for view in views]),
@@ -88,6 +97,8 @@ def render_views(
         ),
         device=torch.tensor([view.has_device for view in views]),
         one_hip=torch.tensor([view.one_hip for view in views]),
+        hips=(255 * hips.data).round().to(torch.uint8),
+        lps_from_hips=hips.lps_from_index,
         xray=torch.tensor([list(asdict(view.model).values()) for view in views], dtype=torch.float64),
         xray_names=tuple(XrayModel.__dataclass_fields__),
         camera=camera,

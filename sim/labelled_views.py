@@ -198,7 +198,7 @@ def render_physics(
     has_device = bool(rng.random() < settings.device.share)
     if has_device:
         device = devices[int(rng.integers(len(devices)))]
-        camera_from_device = _device_pose(device, settings.device, rng)
+        camera_from_device = device_pose(device.mesh, device.points, settings.device, rng)
         areal |= areal_densities({"titanium": device.density}, camera_from_device, camera, settings.step_mm)
     image = fluoroscopy(areal, camera, model, noise)
     labels = render_labels(anatomy, pose, labels_camera)
@@ -209,12 +209,14 @@ def render_physics(
     return PhysicsView(image, labels, landmarks, pose, has_device, one_hip, model)
 
 
-def _device_pose(device: PosableDevice, ranges: DeviceRanges, rng: np.random.Generator) -> Tensor:
+def device_pose(
+    mesh: trimesh.Trimesh, points: dict[str, Tensor], ranges: DeviceRanges, rng: np.random.Generator
+) -> Tensor:
     """Pose (4, 4): the guide in any direction across the image, then leaning and moved aside."""
     direction = rng.uniform(0, 2 * np.pi)
     across = torch.tensor([np.cos(direction), np.sin(direction), 0.0], dtype=torch.float64)
     depth = rng.uniform(*ranges.depth_mm)
-    nominal = nominal_device(device.mesh, device.points, across, depth)
+    nominal = nominal_device(mesh, points, across, depth)
     axis = F.normalize(torch.from_numpy(rng.standard_normal(3)), dim=0)
     angle = np.radians(rng.uniform(-ranges.angle_deg, ranges.angle_deg))
     middle = torch.tensor([0.0, 0.0, depth], dtype=torch.float64)

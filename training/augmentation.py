@@ -29,6 +29,8 @@ class AugmentationSettings:
     gas: float = 0.15  # and of a finer one, as of gas and folds of soft tissue
     edge_share: float = 0.15  # table edges and covers: a straight step of attenuation
     instrument_share: float = 0.35
+    device_share: float = 0.25  # images with a drilling device, where the cohort has any
+    device: tuple[float, float] = (0.15, 1.2)  # factor of its attenuation; log-uniform
     vignetting: float = 0.4  # greatest loss of signal in the corners
     scatter: tuple[float, float] = (0.0, 0.6)  # relative to the mean of the primary beam
     photons: tuple[float, float] = (200.0, 20000.0)  # per pixel of the network's grid at the mean; log-uniform
@@ -37,6 +39,8 @@ class AugmentationSettings:
     gamma: tuple[float, float] = (0.6, 1.7)
     inverted_share: float = 0.05
     collimated_share: float = 0.25
+    collimated_middle: tuple[float, float] = (0.42, 0.58)  # of the field's middle, as shares of the image's width
+    collimated_half: tuple[float, float] = (0.32, 0.5)  # and of its half width and half height
     erased_share: float = 0.2
     rotation_deg: float = 12.0
     scale: tuple[float, float] = (0.85, 1.15)
@@ -160,6 +164,16 @@ def add_instruments(attenuation: Tensor, settings: AugmentationSettings, generat
     return attenuation + step * (distance - _uniform(-0.4, 0.4, (count, 1, 1), generator) * width).clamp(0, 1)
 
 
+def add_devices(attenuation: Tensor, devices: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:
+    """One of `devices` (N, H, H), turned by quarters and mirrored, laid over some of the images (B, H, H)."""
+    count = len(attenuation)
+    shadows = devices[torch.randint(len(devices), (count,), generator=generator)].float()
+    for change in (lambda image: image.mT, lambda image: image.flip(-1), lambda image: image.flip(-2)):
+        shadows = torch.where(_chosen(0.5, count, generator), change(shadows), shadows)
+    there = _chosen(settings.device_share, count, generator)
+    return attenuation + there * _log_uniform(*settings.device, (count, 1, 1), generator) * shadows
+
+
 def expose(attenuation: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:
     """Attenuation (B, H, W) as a detector would show it: scatter, vignetting, noise, blur, saturation.
 
@@ -199,13 +213,18 @@ def alter_contrast(images: Tensor, settings: AugmentationSettings, generator: Ge
 
 
 def collimate(
-    images: Tensor, labels: Tensor, landmarks: Tensor, visible: Tensor, share: float, generator: Generator
+    images: Tensor,
+    labels: Tensor,
+    landmarks: Tensor,
+    visible: Tensor,
+    settings: AugmentationSettings,
+    generator: Generator,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Some images (B, H, W) cut down to a rectangle or a disc; what lies outside is neither labelled nor visible."""
     count, height, width = images.shape
-    chosen = _chosen(share, count, generator)
-    middle = _uniform(0.42, 0.58, (count, 2, 1, 1), generator) * width
-    half = _uniform(0.32, 0.5, (count, 2, 1, 1), generator) * width
+    chosen = _chosen(settings.collimated_share, count, generator)
+    middle = _uniform(*settings.collimated_middle, (count, 2, 1, 1), generator) * width
+    half = _uniform(*settings.collimated_half, (count, 2, 1, 1), generator) * width
     round_field = _chosen(0.5, count, generator)
 
     def covered(column: Tensor, row: Tensor) -> Tensor:
@@ -244,8 +263,9 @@ def make_batch(
     landmarks: Tensor,
     settings: AugmentationSettings,
     generator: Generator,
+    devices: Tensor | None = None,
 ) -> Batch:
-    """Training images from stored layers (shapes as in `sim.dataset`, with N = B views)."""
+    """Training images from stored layers (shapes as in `sim.dataset`, with N = B views) and shadows of `devices`."""
     images = compose(tissue, bones, settings, generator)
     count, shape = len(images), (images.shape[1], images.shape[2])
     flipped = flip_sides(images, labels, landmarks)
@@ -256,8 +276,11 @@ def make_batch(
     visible = inside(landmarks, shape)
     images, labels, landmarks = move(images, labels, landmarks, random_affine(count, shape[0], settings, generator))
     visible &= inside(landmarks, shape)
-    images = expose(add_instruments(images, settings, generator), settings, generator)
+    images = add_instruments(images, settings, generator)
+    if devices is not None:
+        images = add_devices(images, devices, settings, generator)
+    images = expose(images, settings, generator)
     images = alter_contrast(images, settings, generator)
-    images, labels, visible = collimate(images, labels, landmarks, visible, settings.collimated_share, generator)
+    images, labels, visible = collimate(images, labels, landmarks, visible, settings, generator)
     images = erase_boxes(images, settings.erased_share, generator)
     return Batch(normalise(images)[:, None], labels, (landmarks - 0.5) / 2, visible)

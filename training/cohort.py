@@ -3,9 +3,10 @@
 import json
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from safetensors import safe_open
@@ -16,8 +17,12 @@ from femoreg_torch.geometry import load_carm
 from femoreg_torch.volume import read_ct, read_labels, read_landmarks
 from sim.dataset import write_views
 from sim.layers import Layers, deform, smooth_displacement, split_layers
+from sim.mask_landmarks import landmarks_by_rule
 from sim.patient import make_patient
 from sim.views import ViewRanges
+from training.devices import render_devices
+
+_RENDERED = ("views", "deformation_mm", "carm", "seed", "ranges", "landmarks")  # settings that change what is rendered
 
 
 @dataclass(frozen=True)
@@ -33,13 +38,24 @@ class CohortSettings:
     deformation_mm: float = 4.0  # standard deviation of the displacement along each axis
     carm: str = "cios_fusion"
     seed: int = 1
+    landmarks: Literal["carried", "rules"] = "carried"  # of a variant: moved with the bone, or found on it anew
+    devices: int = 0  # images of devices to lay over the views
     ranges: ViewRanges = field(default_factory=ViewRanges)
+
+
+@dataclass(frozen=True)
+class Cohort:
+    """Files of labelled views, and one of device shadows if any were asked for."""
+
+    training: list[Path]
+    validation: list[Path]
+    devices: Path | None
 
 
 def render_cohort(
     settings: CohortSettings, cases: Sequence[Path], cache: Path, report: Callable[[str], None]
-) -> tuple[list[Path], list[Path]]:
-    """Files of labelled views to train on and to validate on, rendered into `cache` unless they are there.
+) -> Cohort:
+    """The views to train on and to validate on, rendered into `cache` unless they are there.
 
     `cases` are folders with ct.nii.gz, labels.nii.gz and landmarks.json. Raises `InputError` if the cache holds views
     made with other settings.
@@ -56,7 +72,11 @@ def render_cohort(
     for seed in settings.validation_seeds:
         make = partial(_make_patient, seed, settings.patient_spacing_mm)
         validation += _variants(settings, cache, f"patient{seed}", settings.patient_variants, make, report)
-    return training, validation
+    devices = None
+    if settings.devices:
+        camera = network_camera(load_carm(settings.carm).camera)
+        devices = render_devices(cache / "devices.safetensors", settings.devices, camera, settings.seed)
+    return Cohort(training, validation, devices)
 
 
 def _read_case(folder: Path) -> Layers:
@@ -79,7 +99,7 @@ def _variants(
     report: Callable[[str], None],
 ) -> list[Path]:
     files = [cache / f"{name}_{variant:02d}.safetensors" for variant in range(count)]
-    how = {k: v for k, v in asdict(settings).items() if k in ("views", "deformation_mm", "carm", "seed", "ranges")}
+    how = {k: v for k, v in asdict(settings).items() if k in _RENDERED}
     source = json.dumps({"patient": name, **how})
     for file in files:
         if file.exists():
@@ -92,6 +112,8 @@ def _variants(
     for variant in missing:
         rng = np.random.default_rng([settings.seed, zlib.crc32(name.encode()), variant])
         patient = deform(layers, smooth_displacement(rng, settings.deformation_mm)) if variant else layers
+        if settings.landmarks == "rules":
+            patient = replace(patient, landmarks=landmarks_by_rule(patient))
         write_views(files[variant], patient, settings.ranges, camera, settings.views, rng, source)
         report(f"rendered {settings.views} views of {name}, variant {variant + 1} of {count}")
     return files

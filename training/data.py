@@ -10,6 +10,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from training.augmentation import AugmentationSettings, Batch, make_batch
+from training.cohort import Cohort
+from training.devices import read_devices
 
 _LAYERS = ("tissue", "bones", "labels", "landmarks")
 
@@ -18,9 +20,16 @@ class ViewBatches(Dataset[Batch]):
     """Batch k, drawn from all files and augmented by a generator seeded with (seed, k)."""
 
     def __init__(
-        self, files: Sequence[Path], batch_size: int, settings: AugmentationSettings, seed: int, length: int
+        self,
+        files: Sequence[Path],
+        batch_size: int,
+        settings: AugmentationSettings,
+        seed: int,
+        length: int,
+        devices: Tensor | None = None,
     ) -> None:
         self.files, self.batch_size, self.settings, self.seed, self.length = files, batch_size, settings, seed, length
+        self.devices = devices
         self._open: dict[Path, safe_open] = {}  # opened by the process that reads
 
     def __len__(self) -> int:
@@ -31,7 +40,7 @@ class ViewBatches(Dataset[Batch]):
         files = torch.randint(len(self.files), (self.batch_size,), generator=generator).tolist()
         views = [self._view(self.files[n], generator) for n in files]
         tissue, bones, labels, landmarks = (torch.stack(layer) for layer in zip(*views, strict=True))
-        return make_batch(tissue, bones, labels, landmarks, self.settings, generator)
+        return make_batch(tissue, bones, labels, landmarks, self.settings, generator, self.devices)
 
     def _view(self, file: Path, generator: torch.Generator) -> list[Tensor]:
         if file not in self._open:
@@ -59,8 +68,7 @@ class ViewData(LightningDataModule):
 
     def __init__(
         self,
-        training: Sequence[Path],
-        validation: Sequence[Path],
+        cohort: Cohort,
         settings: AugmentationSettings,
         batch_size: int,
         batches_per_epoch: int,
@@ -70,8 +78,9 @@ class ViewData(LightningDataModule):
     ) -> None:
         super().__init__()
         self.workers, self.batches_per_epoch = workers, batches_per_epoch
-        self.training = ViewBatches(training, batch_size, settings, seed, batches_per_epoch)
-        self.validation = ViewBatches(validation, batch_size, settings, seed + 1, validation_batches)
+        devices = None if cohort.devices is None else read_devices(cohort.devices)
+        self.training = ViewBatches(cohort.training, batch_size, settings, seed, batches_per_epoch, devices)
+        self.validation = ViewBatches(cohort.validation, batch_size, settings, seed + 1, validation_batches, devices)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         if self.trainer is None:

@@ -1,4 +1,4 @@
-"""How well a network reads images of patients it has not seen: landmarks, bones, and the pose that PnP makes of them.
+"""How well a network reads images of patients it has not seen: landmarks, bones, and the start pose that comes of them.
 
 An image is read as `femoreg detect` reads it. A landmark counts as found if it is visible to `detect`. Errors are over
 those in the image that were found; misses and false finds are counted beside them. Confidence intervals are by
@@ -22,7 +22,8 @@ from femoreg_torch.detect.looks import LOOKS, Look
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import attenuation_image
 from femoreg_torch.geometry import Camera, rotation_angle, transform_points
-from femoreg_torch.pnp import solve_pnp
+from femoreg_torch.registration.start import find_start
+from femoreg_torch.volume import HIP_LANDMARKS, Volume
 from sim.labelled_images import read_labelled
 from training.augmentation import Batch, inside
 
@@ -48,6 +49,7 @@ class LabelledImage:
     visible: Tensor  # (14,) bool
     points: Tensor | None = None  # (14, 3) LPS mm
     camera_from_lps: Tensor | None = None  # (4, 4) rigid
+    hips: Volume | None = None  # 1 inside the hip bones, LPS mm
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ def images_of_file(path: Path) -> Iterable[LabelledImage]:
     """The images of a file of `sim.labelled_images`."""
     content = read_labelled(path)
     points = content.landmarks_lps
+    hips = Volume(content.hips.float() / 255, content.lps_from_hips)
     for n in range(len(content.images)):
         attenuation, pixels = attenuation_image(content.images[n].float()), content.landmarks[n]
         visible = inside(pixels, content.camera.shape)
@@ -111,6 +114,7 @@ def images_of_file(path: Path) -> Iterable[LabelledImage]:
             visible,
             points,
             content.camera_from_lps[n],
+            hips,
         )
 
 
@@ -148,18 +152,12 @@ def _pose_error(detection: Detection, image: LabelledImage) -> Array | None:
     """Degrees, mm across and mm in depth at the landmarks' middle; None if the pose is refused."""
     assert image.points is not None
     assert image.camera_from_lps is not None
-    seen = detection.visible
+    landmarks = dict(zip(HIP_LANDMARKS, image.points, strict=True))
     try:
-        found = solve_pnp(
-            image.points[seen],
-            detection.pixels[seen],
-            image.camera,
-            detection.confidence[seen],
-            detection.deviation_px[seen],
-        )
+        found = find_start(landmarks, detection, image.attenuation, image.camera, image.hips)
     except InputError:
         return None
-    truth, pose = image.camera_from_lps.double(), found.camera_from_object
+    truth, pose = image.camera_from_lps.double(), found.camera_from_ct
     turned = torch.rad2deg(rotation_angle(pose[:3, :3] @ truth[:3, :3].mT)).item()
     middle = image.points.double().mean(0, keepdim=True)
     shift = (transform_points(pose, middle) - transform_points(truth, middle))[0]

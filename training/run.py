@@ -67,14 +67,13 @@ def train_network(
     if last.is_file() and not resume:
         raise InputError(f"{out}: holds a training run. Continue it with --resume, or choose another folder.")
     torch.set_num_threads(settings.threads)
-    training, validation = render_cohort(settings.cohort, cases, cache, console.print)
+    cohort = render_cohort(settings.cohort, cases, cache, console.print)
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "settings.json", {**asdict(settings), "cases": [case.resolve().name for case in cases]})
     seed_everything(settings.seed)
     optimisation = settings.optimisation
     data = ViewData(
-        training,
-        validation,
+        cohort,
         settings.augmentation,
         optimisation.batch_size,
         optimisation.batches_per_epoch,
@@ -88,13 +87,13 @@ def train_network(
     best = ModelCheckpoint(
         out / "checkpoints",
         "best",
-        monitor=_MONITORED if validation else None,
+        monitor=_MONITORED if cohort.validation else None,
         save_last=True,
         enable_version_counter=False,
     )
     callbacks: list[Callback] = [best, EMAWeightAveraging(decay=optimisation.averaging), Pictures()]
     callbacks.append(RichProgressBar(refresh_rate=25))
-    if validation and optimisation.patience:
+    if cohort.validation and optimisation.patience:
         callbacks.append(EarlyStopping(_MONITORED, patience=optimisation.patience))
     trainer = Trainer(
         accelerator=machine.accelerator,
@@ -108,7 +107,7 @@ def train_network(
         callbacks=callbacks,
         enable_model_summary=False,
         log_every_n_steps=min(25, optimisation.batches_per_epoch),
-        limit_val_batches=1.0 if validation else 0,
+        limit_val_batches=1.0 if cohort.validation else 0,
     )
     trainer.fit(module, data, ckpt_path=last if resume else None)
     if not trainer.is_global_zero:  # one process writes

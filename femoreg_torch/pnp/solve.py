@@ -51,14 +51,17 @@ def solve_pnp(
     camera: Camera,
     weights: Tensor | None = None,
     deviations_px: Tensor | None = None,
+    point_deviations_mm: Tensor | None = None,
 ) -> PnpResult:
     """Pose of `points` (N, 3) in LPS mm that were seen at `pixels` (N, 2) (column, row) of `camera`.
 
     `weights` (N,) are positive, for instance the confidences. `deviations_px` (N,) are standard deviations of the
-    landmarks along each axis; with them the pose is the most probable one given that the beam runs from front to back
-    within about 30°, and the covariance is that of this posterior. Only poses are considered that have the points
-    between source and detector and the beam entering from the patient's front, which is the case wherever the image is
-    shown with patient left on the right and head up (or turned by 180°). The result does not depend on chance.
+    landmarks along each axis in the image, `point_deviations_mm` (N,) those of the points themselves (0 if not given),
+    which the image shows magnified; with the former the pose is the most probable one given that the beam runs from
+    front to back within about 30°, and the covariance is that of this posterior. Only poses are considered that have
+    the points between source and detector and the beam entering from the patient's front, which is the case wherever
+    the image is shown with patient left on the right and head up (or turned by 180°). The result does not depend on
+    chance.
 
     Raises `InputError` "too few usable landmarks …" when fewer than four, or fewer than half of the points, agree, or
     if by `deviations_px` the rotation is uncertain by more than 8°.
@@ -78,7 +81,8 @@ def solve_pnp(
         pose, covariance = _refine(pose, points[inliers], pixels[inliers], scale[inliers], camera)
         inliers = _distances(pose, points, pixels, camera) < limit_px
     if pose is not None and _enough(inliers) and deviations_px is not None:
-        pose, covariance = _most_probable(pose, object_points, image_points, deviations_px.double().numpy(), camera)
+        spread = _spread_px(pose.numpy(), object_points, deviations_px, point_deviations_mm, camera)
+        pose, covariance = _most_probable(pose, object_points, image_points, spread, camera)
         inliers = _distances(pose, points, pixels, camera) < limit_px
     if pose is None or not _enough(inliers) or not _plausible(pose.numpy(), object_points, camera):
         raise InputError(
@@ -93,6 +97,18 @@ def solve_pnp(
         )
     distances = _distances(pose, points, pixels, camera)[inliers]
     return PnpResult(pose, torch.from_numpy(inliers), float(np.sqrt((distances**2).mean())), covariance)
+
+
+def _spread_px(
+    camera_from_object: Array, points: Array, deviations_px: Tensor, point_deviations_mm: Tensor | None, camera: Camera
+) -> Array:
+    """Standard deviation (N,) along each axis between a point's shadow and where it was seen."""
+    seen = deviations_px.double().numpy()
+    if point_deviations_mm is None:
+        return np.asarray(seen)
+    depth = points @ camera_from_object[2, :3] + camera_from_object[2, 3]
+    magnified = point_deviations_mm.double().numpy() * camera.sdd_mm / depth / float(np.mean(camera.pixel_mm))
+    return np.asarray(np.hypot(seen, magnified))
 
 
 def _check(points: Tensor, pixels: Tensor, weights: Tensor, deviations_px: Tensor | None) -> None:

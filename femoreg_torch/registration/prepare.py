@@ -6,6 +6,7 @@ from femoreg_torch.case import Case, Device, View
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import attenuation_image, check_matches, read_image
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
+from femoreg_torch.registration.silhouette import hip_mask
 from femoreg_torch.volume import (
     Volume,
     check_inside,
@@ -49,7 +50,7 @@ def prepare_scene(case: Case) -> Scene:
     if case.device is not None:
         device, centre = device_attenuation(case.device), case.device.points["center"]
         objects["device"] = RigidObject(device, centre, ("device",), case.device.camera1_from_device)
-    return Scene(case.carm, objects, images)
+    return Scene(case.carm, objects, images, hips=hip_mask(labels, pelvis_ids))
 
 
 def device_attenuation(device: Device) -> Volume:

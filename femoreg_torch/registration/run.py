@@ -35,7 +35,7 @@ def register_by_plan(case: Case, plan: Plan, seed: int, find: Detector, report: 
     clock["prepared"] = time.perf_counter()
     report("finding landmarks", 0.0)
     seen = find(scene.images["anatomy"][0], scene.carm.camera)
-    camera1_from_pelvis, start = start_from_landmarks(case, seen)
+    camera1_from_pelvis, start = start_from_landmarks(case, scene, seen)
     if plan.needs_segmentations:
         scene = with_segmentations(scene, seen, find)
     clock["started"] = time.perf_counter()

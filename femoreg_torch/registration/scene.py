@@ -40,6 +40,9 @@ class Scene:
     objects: dict[str, RigidObject]
     images: dict[Kind, tuple[Tensor, ...]]  # attenuation images (H, W), one per view
     segmentations: tuple[Segmentation, ...] = ()  # one per view; none unless a stage weighs its pixels by them
+    hips: Volume | None = (
+        None  # 1 inside the hip bones, in the CT's LPS; None if the label map does not tell them apart
+    )
 
     @property
     def views(self) -> int:

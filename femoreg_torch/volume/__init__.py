@@ -4,13 +4,21 @@ from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenu
 from femoreg_torch.volume.device import labelled_device, scanned_device
 from femoreg_torch.volume.grid import Volume, axis_aligned
 from femoreg_torch.volume.labels import label_box_centre
-from femoreg_torch.volume.landmarks import HIP_LANDMARKS, LANDMARK_STEMS, check_inside, read_landmarks, write_landmarks
+from femoreg_torch.volume.landmarks import (
+    HIP_LANDMARKS,
+    LANDMARK_SPREAD_MM,
+    LANDMARK_STEMS,
+    check_inside,
+    read_landmarks,
+    write_landmarks,
+)
 from femoreg_torch.volume.mesh import check_closed, read_mesh, voxelise_mesh
 from femoreg_torch.volume.reading import read_ct, read_labels, read_volume, write_volume
 from femoreg_torch.volume.resample import crop, resample_isotropic
 
 __all__ = [
     "HIP_LANDMARKS",
+    "LANDMARK_SPREAD_MM",
     "LANDMARK_STEMS",
     "Volume",
     "axis_aligned",

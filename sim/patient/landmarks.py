@@ -14,6 +14,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from skimage.morphology import convex_hull_image
 
+from femoreg_torch.errors import InputError
 from sim.patient.sdf import Field
 from sim.patient.skeleton import SIDES, Skeleton
 
@@ -158,13 +159,22 @@ def _symphysis(surface: Points, other: Points, rows: Points) -> tuple[Points, Po
 
 def find_landmarks(skeleton: Skeleton) -> dict[str, Points]:
     """The 14 landmarks by name, (3,) LPS mm, left before right."""
-    hips = {side: skeleton.bones[f"hip_{side}"] for side in SIDES}
+    return find_on_hips({side: skeleton.bones[f"hip_{side}"] for side in SIDES}, skeleton.heads)
+
+
+def find_on_hips(hips: dict[str, Field], heads: dict[str, Points]) -> dict[str, Points]:
+    """The same from the fields of both hip bones and the femoral heads' centres, by side.
+
+    The origin lies near the middle of the heads. Raises `InputError` if an obturator foramen is not to be seen.
+    """
     surfaces = {side: hip.surface() for side, hip in hips.items()}
-    rows, asis = pelvic_frame(surfaces, skeleton.heads)
+    rows, asis = pelvic_frame(surfaces, heads)
     found: dict[str, dict[str, Points]] = {kind: {} for kind in ("FH", "GSN", "IOF", "MOF", "SPS", "IPS", "ASIS")}
     for (side, sign), other in zip(SIDES.items(), ("right", "left"), strict=True):
         rim = obturator_rim(hips[side], rows, sign)
-        found["FH"][side], found["ASIS"][side] = skeleton.heads[side], asis[side]
+        if not len(rim):
+            raise InputError(f"landmarks: the {side} hip bone has no obturator foramen to see through.")
+        found["FH"][side], found["ASIS"][side] = heads[side], asis[side]
         found["GSN"][side] = sciatic_notch(hips[side], rows)
         found["IOF"][side] = rim[(rim @ rows[2]).argmin()]
         found["MOF"][side] = rim[(sign * rim @ rows[0]).argmin()]

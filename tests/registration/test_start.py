@@ -19,6 +19,7 @@ CASE: Any = SimpleNamespace(
     landmarks={name: torch.zeros(3, dtype=torch.float64) for name in HIP_LANDMARKS},
     carm=SimpleNamespace(camera=CAMERA),
 )
+SCENE: Any = SimpleNamespace(images={"anatomy": (torch.rand(CAMERA.shape),)}, hips=None)
 
 
 def detection(visible: int, inverted: bool) -> Detection:
@@ -30,9 +31,9 @@ def detection(visible: int, inverted: bool) -> Detection:
 
 def test_too_few_landmarks_are_refused() -> None:
     with pytest.raises(InputError, match=r"view1.tif: 3 usable landmarks found, at least 4"):
-        start_from_landmarks(CASE, detection(3, inverted=False))
+        start_from_landmarks(CASE, SCENE, detection(3, inverted=False))
 
 
 def test_inverted_grey_values_are_refused_however_many_landmarks_there_are() -> None:
     with pytest.raises(InputError, match=r"view1.tif: bone seems to be darker"):
-        start_from_landmarks(CASE, detection(14, inverted=True))
+        start_from_landmarks(CASE, SCENE, detection(14, inverted=True))
