@@ -6,7 +6,7 @@ from pathlib import Path
 
 from femoreg_torch.files import write_json, write_text
 from femoreg_torch.volume import HIP_LANDMARKS
-from training.measure import COARSE, FAIR, Accuracy, Measure
+from training.measure import COARSE, FAIR, REGISTERED_DEG, Accuracy, Measure
 
 _SHARE, _MM = "share", "mm"
 _ROWS = {  # figure → what it is called, and its unit
@@ -27,6 +27,7 @@ _ROWS = {  # figure → what it is called, and its unit
     "pose_fair": ("pose within {:g}°, {:g} mm across, {:g} mm in depth".format(*FAIR), _SHARE),
     "pose_coarse": ("pose within {:g}°, {:g} mm, {:g} mm".format(*COARSE), _SHARE),
     "pose_refused": ("pose refused", _SHARE),
+    "registered_1deg": (f"pelvis within {REGISTERED_DEG:g}° after single-view registration", _SHARE),
     "rotation_median_deg": ("rotation error, median", "°"),
 }
 

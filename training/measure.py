@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 GROSS_MM = 20.0
 FAIR = (5.0, 10.0, 50.0)  # degrees, mm across, mm in depth
 COARSE = (10.0, 20.0, 100.0)
+REGISTERED_DEG = 1.0
 _LEAST_VISIBLE = 6  # landmarks in an image that a pose is asked of
 _LABELS = range(1, 7)
 _REDRAWS = 2000
@@ -65,6 +66,7 @@ class Reading:
     asked: bool  # whether a pose was asked for
     refused: bool  # no pose was given
     pose_error: Array  # (3,) degrees, mm across, mm in depth at the landmarks' middle; nan without a pose
+    registered_error: Array | None = None  # (3,) the same after single-view registration, if it was run
 
 
 @dataclass(frozen=True)
@@ -118,12 +120,19 @@ def images_of_file(path: Path) -> Iterable[LabelledImage]:
         )
 
 
-def read_images(network: nn.Module, images: Iterable[LabelledImage], looks: tuple[Look, ...] = LOOKS) -> list[Reading]:
-    """Detect and, where there is a patient's geometry, solve for the pose of each image."""
-    return [_read(detect(network, image.attenuation, image.camera, looks), image) for image in images]
+def read_images(
+    network: nn.Module,
+    images: Iterable[LabelledImage],
+    looks: tuple[Look, ...] = LOOKS,
+    register: Callable[[LabelledImage, Tensor], Tensor] | None = None,
+) -> list[Reading]:
+    """Detect and, where there is a patient's geometry, find the start pose of each image, and then `register` it."""
+    return [_read(detect(network, image.attenuation, image.camera, looks), image, register) for image in images]
 
 
-def _read(detection: Detection, image: LabelledImage) -> Reading:
+def _read(
+    detection: Detection, image: LabelledImage, register: Callable[[LabelledImage, Tensor], Tensor] | None
+) -> Reading:
     pixel_mm = torch.tensor(image.camera.pixel_mm[::-1], dtype=torch.float64)
     error = ((detection.pixels - image.landmarks) * pixel_mm).norm(dim=1)
     there = image.visible & inside(image.landmarks, image.camera.shape)
@@ -134,7 +143,8 @@ def _read(detection: Detection, image: LabelledImage) -> Reading:
         for n in _LABELS
     ]
     asked = image.points is not None and image.camera_from_lps is not None and int(there.sum()) >= _LEAST_VISIBLE
-    pose_error = _pose_error(detection, image) if asked else None
+    start = _start(detection, image) if asked else None
+    registered = register(image, start) if register is not None and start is not None else None
     return Reading(
         image.patient,
         error.numpy(),
@@ -143,21 +153,29 @@ def _read(detection: Detection, image: LabelledImage) -> Reading:
         detection.confidence.numpy(),
         np.array(overlap),
         asked,
-        asked and pose_error is None,
-        np.full(3, np.nan) if pose_error is None else pose_error,
+        asked and start is None,
+        _pose_error(start, image),
+        None if register is None else _pose_error(registered, image),
     )
 
 
-def _pose_error(detection: Detection, image: LabelledImage) -> Array | None:
-    """Degrees, mm across and mm in depth at the landmarks' middle; None if the pose is refused."""
+def _start(detection: Detection, image: LabelledImage) -> Tensor | None:
+    """The start pose (4, 4); None if it is refused."""
     assert image.points is not None
-    assert image.camera_from_lps is not None
     landmarks = dict(zip(HIP_LANDMARKS, image.points, strict=True))
     try:
-        found = find_start(landmarks, detection, image.attenuation, image.camera, image.hips)
+        return find_start(landmarks, detection, image.attenuation, image.camera, image.hips).camera_from_ct
     except InputError:
         return None
-    truth, pose = image.camera_from_lps.double(), found.camera_from_ct
+
+
+def _pose_error(pose: Tensor | None, image: LabelledImage) -> Array:
+    """Degrees, mm across and mm in depth (3,) at the landmarks' middle; nan without a pose."""
+    if pose is None:
+        return np.full(3, np.nan)
+    assert image.points is not None
+    assert image.camera_from_lps is not None
+    truth = image.camera_from_lps.double()
     turned = torch.rad2deg(rotation_angle(pose[:3, :3] @ truth[:3, :3].mT)).item()
     middle = image.points.double().mean(0, keepdim=True)
     shift = (transform_points(pose, middle) - transform_points(truth, middle))[0]
@@ -207,6 +225,8 @@ def _figures(readings: Sequence[Reading]) -> dict[str, float]:
     figures["pose_fair"] = _of(np.mean, np.all(poses < np.array(FAIR), axis=1))
     figures["pose_coarse"] = _of(np.mean, np.all(poses < np.array(COARSE), axis=1))
     figures["pose_refused"] = _of(np.mean, refused)
+    registered = np.array([r.registered_error for r in readings if r.asked and r.registered_error is not None])
+    figures["registered_1deg"] = _of(np.mean, registered.reshape(-1, 3)[:, 0] < REGISTERED_DEG)
     figures["rotation_median_deg"] = _of(np.nanmedian, poses[:, 0])
     return figures
 

@@ -1,5 +1,7 @@
 """From a case on disk to the scene that is registered."""
 
+from collections.abc import Mapping
+
 from torch import Tensor
 
 from femoreg_torch.case import Case, Device, View
@@ -36,21 +38,27 @@ def prepare_scene(case: Case) -> Scene:
     ct = read_ct(case.ct_path)
     labels = read_labels(case.labels_path, ct)
     check_inside(case.landmarks, ct)
-    pelvis_ids, femur_ids = case.structures["pelvis"], case.structures[case.femur]
-    middle = label_box_centre(labels, pelvis_ids)
-    if max(abs(s - REGISTRATION_SPACING_MM) for s in ct.spacing_mm) > 1e-3:
-        labels = resample_isotropic(labels, REGISTRATION_SPACING_MM, nearest=True)
-        ct = resample_isotropic(ct, REGISTRATION_SPACING_MM)
-    pelvis, femur = (structure_attenuation(ct, labels, ids) for ids in (pelvis_ids, femur_ids))
-    always: tuple[Kind, ...] = ("anatomy", "device")
-    objects = {
-        "pelvis": RigidObject(pelvis, middle, always, classes=_CLASSES["pelvis"]),
-        "femur": RigidObject(femur, case.femoral_head, always, classes=_CLASSES[case.femur]),
-    }
+    objects = anatomy_objects(ct, labels, case.structures, case.femur, case.femoral_head)
     if case.device is not None:
         device, centre = device_attenuation(case.device), case.device.points["center"]
         objects["device"] = RigidObject(device, centre, ("device",), case.device.camera1_from_device)
-    return Scene(case.carm, objects, images, hips=hip_mask(labels, pelvis_ids))
+    return Scene(case.carm, objects, images, hips=hip_mask(labels, case.structures["pelvis"]))
+
+
+def anatomy_objects(
+    ct: Volume, labels: Volume, structures: Mapping[str, tuple[int, ...]], femur: str, femoral_head: Tensor
+) -> dict[str, RigidObject]:
+    """Pelvis and one femur (`femur_left` or `femur_right`) of a CT in HU with a label map on the same grid."""
+    middle = label_box_centre(labels, structures["pelvis"])
+    if max(abs(s - REGISTRATION_SPACING_MM) for s in ct.spacing_mm) > 1e-3:
+        labels = resample_isotropic(labels, REGISTRATION_SPACING_MM, nearest=True)
+        ct = resample_isotropic(ct, REGISTRATION_SPACING_MM)
+    pelvis, bone = (structure_attenuation(ct, labels, structures[name]) for name in ("pelvis", femur))
+    always: tuple[Kind, ...] = ("anatomy", "device")
+    return {
+        "pelvis": RigidObject(pelvis, middle, always, classes=_CLASSES["pelvis"]),
+        "femur": RigidObject(bone, femoral_head, always, classes=_CLASSES[femur]),
+    }
 
 
 def device_attenuation(device: Device) -> Volume:
