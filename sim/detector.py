@@ -41,8 +41,8 @@ def blur(image: Tensor, sigma_px: float) -> Tensor:
 def gain_pattern(shape: tuple[int, int], spread: float) -> Tensor:
     """Gain (H, W) of each pixel after flat-field correction: mean 1, and `spread` as standard deviation.
 
-    Half of the variance is that of single pixels, half that of columns, which share an amplifier (Seibert et al., Flat
-    field correction technique for digital detectors, Proc SPIE 3336 (1998) 348).
+    Half of the variance, a share chosen here, is that of single pixels, half that of columns, which share an amplifier
+    (on flat-field correction: Seibert et al., Proc SPIE 3336 (1998) 348).
     """
     generator = torch.Generator().manual_seed(_PATTERN_SEED)
     pixels, columns = torch.randn(shape, generator=generator), torch.randn(shape[1], generator=generator)

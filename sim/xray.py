@@ -82,9 +82,9 @@ def photons_per_pixel(model: XrayModel, camera: Camera) -> float:
 def scattered(primary: Tensor, model: XrayModel, camera: Camera, beam: Tensor) -> Tensor:
     """Scatter (H, W) in units of the open beam: a wide blur of −P ln P, the forward-scatter model.
 
-    `primary` (H, W) is the share P that is transmitted, `beam` (H, W) what falls on the object. Ohnesorge, Flohr,
-    Klingenbeck-Regn, Efficient object scatter correction algorithm for third and fourth generation CT scanners, Eur
-    Radiol 9 (1999) 563.
+    `primary` (H, W) is the share P that is transmitted, `beam` (H, W) what falls on the object. A convolution of the
+    weighted projection as in Ohnesorge, Flohr, Klingenbeck-Regn, Efficient object scatter correction algorithm for
+    third and fourth generation CT scanners, Eur Radiol 9 (1999) 563; the weight and the Gaussian are chosen here.
     """
     source = -primary * primary.clamp_min(1e-8).log() * beam
     coarse = max(1, round(model.scatter_sigma_mm / camera.pixel_mm[0] / 8))  # the field is smooth: 8 samples per sigma
