@@ -50,8 +50,9 @@ def tissue_densities(hu: Tensor) -> tuple[Tensor, Tensor]:
     """Mass densities in g/cm³ of (water-like soft tissue, cortical bone) that together make up voxels of these HU.
 
     Total density: ρ = 1.03 + 0.001029 HU below water and 1.03 + 0.0005886 HU above (`conv_hu_to_density` of DeepDRR,
-    Unberath et al., MICCAI 2018; within 1 % that of Schneider et al., Phys Med Biol 45 (2000) 459). Between muscle and cortical bone a voxel
-    is a mixture by volume, so the split is linear in HU and a voxel at the rim of a bone is neither one nor the other.
+    Unberath et al., MICCAI 2018; within 1 % that of Schneider et al., Phys Med Biol 45 (2000) 459). Between muscle and
+    cortical bone a voxel is a mixture by volume, so the split is linear in HU and a voxel at the rim of a bone is
+    neither one nor the other.
     """
     total = torch.minimum(1.03 + 0.001029 * hu, 1.03 + _TOTAL_PER_HU * hu).clamp_min(0)
     share = ((hu - _SOFT_HU) / (_BONE_HU - _SOFT_HU)).clamp_min(0)
