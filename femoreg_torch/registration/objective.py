@@ -1,12 +1,14 @@
 """The objective of a stage: mean similarity cost of a batch of candidate deltas (paper, equations 1, 3, 4)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from femoreg_torch.drr import project, project_with_jacobian
+from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, invert_rigid, transform_points
 from femoreg_torch.optimize import Quadratic, SmoothObjective
@@ -15,6 +17,8 @@ from femoreg_torch.registration.weights import Weighting, pixel_weights
 from femoreg_torch.similarity import GradNcc, grad_ncc, grad_ncc_quadratic
 
 _STEP = 1e-5  # of a delta, for the derivatives of poses
+_TISSUE_PX = 16  # pixels of the detector between those where the soft tissue is drawn; it is smooth
+_TISSUE_STEP_MM = 3.0
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,30 @@ class Level:
     downsample: int
     step_mm: float
     patch_radius: int
+
+
+@dataclass(frozen=True)
+class Imaging:
+    """How the images differ from plain line integrals of the objects.
+
+    `scatter` is the scattered light per primary light behind the patient but for what is drawn: it fills dark shadows,
+    so that −log flattens there, and their edges seem to lie farther out. `tissue` is the soft tissue's attenuation in
+    the images per attenuation in the CT (harder light); 0 draws none.
+    """
+
+    scatter: float = 0.0
+    tissue: float = 0.0
+
+    def image(self, integrals: Tensor) -> Tensor:
+        """What is seen of line integrals."""
+        return -((-integrals).exp() + self.scatter).log() if self.scatter else integrals
+
+    def slope(self, integrals: Tensor) -> Tensor:
+        """Its derivative by them."""
+        return 1 / (1 + self.scatter * integrals.exp())
+
+
+PLAIN = Imaging()
 
 
 @dataclass(frozen=True)
@@ -44,6 +72,17 @@ class _Target:
     similarity: GradNcc
     background: Tensor  # (H, W), line integrals of all that stands still
     moving: tuple[str, ...]
+    tissue: Tensor | None  # (H, W): seen besides, or nothing
+    imaging: Imaging
+
+    def cost(self, drawn: Tensor) -> Tensor:
+        """Costs (P,) of line integrals (P, H, W)."""
+        return self.similarity(self.seen(drawn))
+
+    def seen(self, drawn: Tensor) -> Tensor:
+        """Images (..., H, W) of line integrals."""
+        image = self.imaging.image(drawn)
+        return image if self.tissue is None else image + self.tissue
 
 
 def _target(
@@ -54,6 +93,7 @@ def _target(
     image: tuple[Kind, int],
     level: Level,
     weights: Sequence[Weighting],
+    imaging: Imaging,
 ) -> _Target:
     kind, view = image
     camera = scene.carm.camera.downsampled(level.downsample)
@@ -68,7 +108,20 @@ def _target(
     placing = [name for body in bodies for name in body.objects]
     looked_at = pixel_weights(scene, poses, render, placing, image, camera, level.step_mm, weights)
     similarity = grad_ncc(fixed, level.patch_radius, weights=looked_at)
-    return _Target(view, camera, similarity, background, tuple(name for name in drawn if name in moves))
+    tissue = imaging.tissue * _tissue(scene, poses, view, camera) if imaging.tissue else None
+    return _Target(view, camera, similarity, background, tuple(n for n in drawn if n in moves), tissue, imaging)
+
+
+def _tissue(scene: Scene, poses: Poses, view: int, camera: Camera) -> Tensor:
+    """Line integrals (H, W) of the soft tissue, where the pelvis is: on coarse pixels, and interpolated."""
+    if scene.tissue is None:
+        raise InputError("a stage draws soft tissue (`imaging`), but the scene has none.")
+    factor = max(1, round(_TISSUE_PX * scene.carm.camera.pixel_mm[0] / camera.pixel_mm[0]))
+    rows, columns = (-(-n // factor) * factor for n in camera.shape)
+    wide = replace(camera, shape=(rows, columns)).downsampled(factor)
+    coarse = project([scene.tissue], poses.camera_from("pelvis")[view][None, None], wide, _TISSUE_STEP_MM)
+    fine = F.interpolate(coarse[None], size=(rows, columns), mode="bicubic", antialias=True)[0, 0]
+    return fine[: camera.shape[0], : camera.shape[1]].contiguous()
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +142,7 @@ class ImageCosts:
             if target.moving:
                 volumes = [self.objects[name].volume for name in target.moving]
                 drawn = drawn + project(volumes, self._placed(target, deltas), target.camera, self.step_mm)
-            columns.append(target.similarity(drawn))
+            columns.append(target.cost(drawn))
         return torch.stack(columns, 1)
 
     def quadratics(self, delta: Tensor) -> list[Quadratic]:
@@ -107,7 +160,7 @@ class ImageCosts:
     def _quadratic(self, target: _Target, delta: Tensor) -> Quadratic:
         n = len(delta)
         if not target.moving:
-            cost = float(target.similarity(target.background[None]))
+            cost = float(target.cost(target.background[None]))
             return Quadratic(cost, delta.new_zeros(1, n), delta.new_zeros(n, n))
         drawn, jacobians, twists = target.background, [], []
         placed = self._placed(target, delta[None])[0]  # (O, 4, 4)
@@ -119,7 +172,8 @@ class ImageCosts:
             jacobians.append(jacobian[0])
             twists.append(_twists(change, pose, centre))
         # Six twists per object span all that the deltas do to this image.
-        cost, scores, hessian = grad_ncc_quadratic(target.similarity, drawn, torch.cat(jacobians, -1))
+        changes = torch.cat(jacobians, -1) * target.imaging.slope(drawn)[..., None]
+        cost, scores, hessian = grad_ncc_quadratic(target.similarity, target.seen(drawn), changes)
         by_delta = torch.cat(twists)  # (6 O, n)
         return Quadratic(cost, scores @ by_delta, by_delta.T @ hessian @ by_delta)
 
@@ -147,13 +201,14 @@ def image_costs(
     images: Sequence[tuple[Kind, int]],
     level: Level,
     weights: Sequence[Weighting] = (),
+    imaging: Imaging = PLAIN,
 ) -> ImageCosts:
     """Similarity costs of `images`, (kind, view) pairs, as functions of deltas (P, Σ n_b) of the bodies.
 
     Objects of `render` that no body moves are drawn once and added. `weights` says which pixels count, see
     `pixel_weights`, by default all. Raises `InputError` for an image that they leave no pixel of.
     """
-    targets = tuple(_target(scene, poses, bodies, render, image, level, weights) for image in images)
+    targets = tuple(_target(scene, poses, bodies, render, image, level, weights, imaging) for image in images)
     return ImageCosts(scene.objects, poses, bodies, level.step_mm, targets)
 
 

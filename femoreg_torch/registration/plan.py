@@ -8,7 +8,7 @@ from jsonargparse import ArgumentError, ArgumentParser
 from femoreg_torch.configs import load_preset
 from femoreg_torch.errors import InputError
 from femoreg_torch.optimize import Bobyqa, CmaEs, LevenbergMarquardt
-from femoreg_torch.registration.objective import Level, Prior
+from femoreg_torch.registration.objective import PLAIN, Imaging, Level, Prior
 from femoreg_torch.registration.scene import Kind
 from femoreg_torch.registration.weights import Weighting
 
@@ -36,6 +36,7 @@ class Stage:
     """One optimisation. `images` says which views take part: the first, each other view by itself, or all together.
 
     Objects are named as in the scene. `weights` says which pixels count, see `pixel_weights`; by default all do.
+    `imaging` says what is drawn besides the objects; by default nothing.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Stage:
     optimiser: CmaEs | Bobyqa | LevenbergMarquardt
     prior: Prior | None = None
     weights: list[Weighting] = field(default_factory=list)
+    imaging: Imaging = PLAIN
 
     @property
     def objects(self) -> set[str]:

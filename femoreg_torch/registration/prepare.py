@@ -12,6 +12,7 @@ from femoreg_torch.registration.silhouette import hip_mask
 from femoreg_torch.volume import (
     Volume,
     check_inside,
+    hu_to_attenuation,
     label_box_centre,
     labelled_device,
     read_ct,
@@ -25,6 +26,8 @@ from femoreg_torch.volume import (
 
 REGISTRATION_SPACING_MM = 1.0  # the paper resamples the CT to 1 mm (section III-A)
 _CLASSES = {"pelvis": (1, 2, 4), "femur_left": (5,), "femur_right": (6,)}  # of the landmark network's segmentation
+TISSUE_SPACING_MM = 3.0  # soft tissue is smooth
+SOFT_HU = 50.0  # what is above is drawn as bone
 DEVICE_SPACING_MM = 0.5  # a sleeve's wall is thinner than a CT voxel
 
 
@@ -42,7 +45,9 @@ def prepare_scene(case: Case) -> Scene:
     if case.device is not None:
         device, centre = device_attenuation(case.device), case.device.points["center"]
         objects["device"] = RigidObject(device, centre, ("device",), case.device.camera1_from_device)
-    return Scene(case.carm, objects, images, hips=hip_mask(labels, case.structures["pelvis"]))
+    soft = hu_to_attenuation(ct.data.float().clamp_max(SOFT_HU), -1000.0)
+    tissue = resample_isotropic(ct.with_data(soft), TISSUE_SPACING_MM)
+    return Scene(case.carm, objects, images, tissue=tissue, hips=hip_mask(labels, case.structures["pelvis"]))
 
 
 def anatomy_objects(

@@ -97,7 +97,7 @@ def run_stage(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], 
     began = time.perf_counter()
     bodies = tuple(body for plan in stage.bodies for body in _bodies(scene, poses, plan, views))
     images: list[tuple[Kind, int]] = [(kind, view) for kind in stage.kinds for view in views]
-    costs = image_costs(scene, poses, bodies, stage.render, images, stage.level, stage.weights)
+    costs = image_costs(scene, poses, bodies, stage.render, images, stage.level, stage.weights, stage.imaging)
     objective = stage_objective(costs, bodies, stage.prior)
     result = minimise(objective, sum(len(body.free) for body in bodies), stage.optimiser, seed)
     view = views[0] if stage.images == "each other" else None

@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from registration_scenes import REFERENCE_POINTS, float64, make_scene, off, segmentations, true_poses
+from registration_scenes import REFERENCE_POINTS, VOLUMES, float64, make_scene, off, segmentations, true_poses
 
-from femoreg_torch.registration.objective import Level, Prior, image_costs, stage_objective
+from femoreg_torch.errors import InputError
+from femoreg_torch.registration.objective import PLAIN, Imaging, Level, Prior, image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, reference_point_in_view
 from femoreg_torch.registration.weights import Weighting
 
@@ -15,10 +16,12 @@ _LEVEL = Level(downsample=1, step_mm=2.0, patch_radius=5)
 _SCALE = float64(*[math.radians(1)] * 3, 1.0, 1.0, 4.0)
 
 
-def _joint_objective(prior: Prior | None = None, weights: tuple[Weighting, ...] = ()):  # type: ignore[no-untyped-def]
+def _joint_objective(  # type: ignore[no-untyped-def]
+    prior: Prior | None = None, weights: tuple[Weighting, ...] = (), imaging: Imaging = PLAIN
+):
     """Every object and every C-arm but the first free, a little off the truth."""
     poses = true_poses()
-    scene = replace(make_scene(poses), segmentations=segmentations(poses))
+    scene = replace(make_scene(poses), segmentations=segmentations(poses), tissue=VOLUMES["femur"])
     for name, point in REFERENCE_POINTS.items():
         poses = poses.with_object(name, off(poses.camera1_from[name], point, (0.5, -0.4, 0.6), (0.5, 0.4, -2)))
     objects = tuple(
@@ -26,18 +29,20 @@ def _joint_objective(prior: Prior | None = None, weights: tuple[Weighting, ...] 
     )
     views = tuple(Body((), v, reference_point_in_view(scene, poses, "pelvis", v), _SCALE) for v in (1, 2))
     images = [(kind, view) for kind in ("anatomy", "device") for view in range(3)]
-    costs = image_costs(scene, poses, (*objects, *views), tuple(REFERENCE_POINTS), images, _LEVEL, weights)
+    costs = image_costs(scene, poses, (*objects, *views), tuple(REFERENCE_POINTS), images, _LEVEL, weights, imaging)
     return stage_objective(costs, (*objects, *views), prior)
 
 
-@pytest.mark.parametrize("weights", [(), ("bones",)])
+@pytest.mark.parametrize(
+    ("weights", "imaging"), [((), PLAIN), (("bones",), PLAIN), ((), Imaging(scatter=0.4, tissue=0.8))]
+)
 def test_the_gradient_is_the_slope_of_the_values_and_the_curvature_is_never_negative(
-    weights: tuple[Weighting, ...],
+    weights: tuple[Weighting, ...], imaging: Imaging
 ) -> None:
-    objective = _joint_objective(Prior(rotation_deg=5, translation_mm=10, weight=0.1), weights)
+    objective = _joint_objective(Prior(rotation_deg=5, translation_mm=10, weight=0.1), weights, imaging)
     delta = 0.3 * torch.randn(30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     model = objective.quadratic(delta)
-    h = 0.02
+    h = 0.04  # smaller steps drown in the rounding of single precision
     moved = delta + h * torch.cat([torch.eye(30), -torch.eye(30)]).double()
     values = objective(moved)
     slope = (values[:30] - values[30:]) / (2 * h)
@@ -59,3 +64,20 @@ def test_at_the_solution_the_curvature_is_that_of_the_values() -> None:
         step[0, axis], step[2, axis] = -0.6, 0.6
         below, here, above = objective(step).tolist()
         assert abs((below + above - 2 * here) / 0.6**2 / float(hessian[axis, axis]) - 1) < 0.25, axis
+
+
+def test_scatter_fills_dark_shadows() -> None:
+    """I = exp(−L) + s, seen as −log I: thin parts hardly change, and thick metal cannot be darker than the scatter."""
+    integrals = torch.tensor([0.0, 1.0, 30.0], dtype=torch.float64, requires_grad=True)
+    seen = Imaging(scatter=0.25).image(integrals)
+    expected = [-math.log(1.25), -math.log(math.exp(-1) + 0.25), -math.log(0.25)]
+    assert seen.tolist() == pytest.approx(expected)
+    assert torch.equal(PLAIN.image(integrals), integrals)
+    slope = torch.autograd.grad(seen.sum(), integrals)[0]
+    assert torch.allclose(slope, Imaging(scatter=0.25).slope(integrals.detach()))
+
+
+def test_tissue_must_be_there_to_be_drawn() -> None:
+    poses = true_poses()
+    with pytest.raises(InputError, match="the scene has none"):
+        image_costs(make_scene(poses), poses, (), ("pelvis",), [("anatomy", 0)], _LEVEL, (), Imaging(tissue=1.0))
