@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test lint bench bench-gpu accuracy capture-range ablation
+.PHONY: setup demo test lint bench bench-gpu accuracy capture-range trust ablation
 
 setup: .venv/.installed
 
@@ -46,6 +46,9 @@ accuracy: .venv/.study
 
 capture-range: .venv/.study
 	$(BIN)/python -m sim.study capture-range --preset $(PRESET) --docs docs
+
+trust: .venv/.study
+	$(BIN)/python -m sim.study trust --preset $(PRESET) --docs docs
 
 ablation: .venv/.study
 	$(BIN)/python -m sim.study ablation --jobs $(JOBS) --docs docs

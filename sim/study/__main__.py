@@ -16,6 +16,7 @@ from sim.study import capture
 from sim.study.cases import Stores, ready
 from sim.study.procedures import Procedure, Study, load_study, procedures
 from sim.study.timing import time_register
+from sim.study.trust import sabotaged_runs, write_trust
 
 _DATA = Path(os.environ.get("FEMOREG_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 _OUT = Path("out/accuracy")
@@ -109,6 +110,34 @@ def capture_range(
     print(capture.write_capture(records, plan, out / "capture", docs))
 
 
+def trust(
+    preset: str = "fast",
+    first: int = 4,
+    starts: int = 8,
+    kind: Kind = "all",
+    out: Path = _OUT,
+    patients: Path | None = None,
+    data: Path = _DATA,
+    docs: Path | None = None,
+) -> None:
+    """Whole runs from starts that are meant to go wrong, and whether they say so.
+
+    Args:
+        preset: registration preset.
+        first: procedures to start on.
+        starts: of every kind, over all procedures together.
+        kind: patients to take.
+        out: folder of cases and results.
+        patients: CTs around real bone shapes; OUT/patients if not given.
+        data: real bone shapes; the environment's FEMOREG_DATA, if set.
+        docs: folder of the page that is to be renewed.
+    """
+    study, chosen, stores = _chosen(first, kind, out, patients, data)
+    measurement.make_cases(chosen, study, stores, 1)
+    records = sabotaged_runs([stores.case(p) for p in chosen], load_plan(preset), starts)
+    print(write_trust(records, preset, out / "trust", docs))
+
+
 def ablation(
     variants_file: Path = Path("configs/study/ablation.yaml"),
     first: int = 8,
@@ -170,6 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "accuracy": accuracy,
         "cases": cases,
         "capture-range": capture_range,
+        "trust": trust,
         "ablation": ablation,
         "list": listing,
     }
