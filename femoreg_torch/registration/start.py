@@ -35,16 +35,10 @@ class Start:
 def start_from_landmarks(case: Case, scene: Scene, detection: Detection) -> tuple[Tensor, dict[str, Any]]:
     """`camera1_from_pelvis` (4, 4) from what is seen in view 1, and what to keep of how it came.
 
-    Raises `InputError` if the landmarks do not fix a pose, if the bones seen contradict it, or if the grey values are
-    inverted, which would mislead the similarity even where the landmarks are found.
+    Raises `InputError` as `find_start` does, with the image's name.
     """
     image = scene.images["anatomy"][0]
     try:
-        if detection.inverted:
-            raise InputError(
-                "bone seems to be darker than soft tissue where it should be brighter. Set `intensity` of the view "
-                "(raw: bone dark, log: bone bright), or invert the picture."
-            )
         start = find_start(case.landmarks, detection, image, case.carm.camera, scene.hips)
     except InputError as error:
         raise InputError(f"{case.views[0].anatomy}: {error}") from error
@@ -56,9 +50,15 @@ def find_start(
 ) -> Start:
     """The pose of a CT with `landmarks` (3,) in an image (H, W), by PnP and then by the outlines of its `hips`.
 
-    Raises `InputError` if fewer than four landmarks are of use or agree, or if the hip bones drawn at the pose cover
-    those that the network sees by less than 88 % (Dice).
+    Raises `InputError` if the grey values are inverted, which would mislead the similarity even where the landmarks are
+    found, if fewer than four landmarks are of use or agree, or if the hip bones drawn at the pose cover those that the
+    network sees by less than 88 % (Dice).
     """
+    if detection.inverted:
+        raise InputError(
+            "bone seems to be darker than soft tissue where it should be brighter. Set `intensity` of the view (raw: "
+            "bone dark, log: bone bright), or invert the picture."
+        )
     usable = [i for i, name in enumerate(HIP_LANDMARKS) if name in landmarks and bool(detection.visible[i])]
     if len(usable) < MINIMUM:
         raise InputError(
