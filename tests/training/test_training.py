@@ -16,6 +16,7 @@ from models.unet import UNet, UNetConfig
 from models.weights import save_weights
 from training.commands import train
 from training.data import ViewBatches
+from training.devices import read_devices
 from training.run import _begin_with
 from training.settings import read_settings
 
@@ -111,6 +112,16 @@ def test_a_cache_of_other_settings_is_refused(settings: Path, case: Path, tmp_pa
     train(settings, out=tmp_path / "run", cases=[case], cache=cache)
     with pytest.raises(InputError, match="rendered with other settings"):
         train(settings, out=tmp_path / "run2", cases=[case], cache=cache, override=["cohort.views=5"])
+
+
+def test_devices_are_rendered_and_landmarks_found_by_rule_where_asked_for(
+    settings: Path, case: Path, tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache"
+    train(settings, out=tmp_path / "run", cases=[case], cache=cache, override=["cohort.devices=2"])
+    assert len(read_devices(cache / "devices.safetensors")) == 2
+    with pytest.raises(InputError, match="no obturator foramen"):  # these hip bones are boxes
+        train(settings, out=tmp_path / "2", cases=[case], cache=tmp_path / "c2", override=["cohort.landmarks=rules"])
 
 
 def test_bad_settings(settings: Path, tmp_path: Path) -> None:
