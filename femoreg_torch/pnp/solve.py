@@ -157,9 +157,12 @@ def _consensus(points: Array, pixels: Array, weights: Array, camera: Camera, lim
     best, best_cost = None, np.inf
     for subset in _subsets(len(points)):
         chosen = list(subset)
-        found, rotations, translations, _ = cv2.solvePnPGeneric(
-            points[chosen], pixels[chosen], matrix, None, flags=cv2.SOLVEPNP_SQPNP
-        )
+        try:
+            found, rotations, translations, _ = cv2.solvePnPGeneric(
+                points[chosen], pixels[chosen], matrix, None, flags=cv2.SOLVEPNP_SQPNP
+            )
+        except cv2.error:  # points too close together: OpenCV asserts a least variance
+            continue
         for n in range(found):
             pose = np.eye(4)
             pose[:3, :3] = cv2.Rodrigues(rotations[n])[0]

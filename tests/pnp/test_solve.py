@@ -206,3 +206,12 @@ def test_a_rotation_left_open_is_refused() -> None:
     assert solve_pnp(PELVIS[few], pixels[few], CAMERA).inliers.all()
     with pytest.raises(InputError, match=r"too few usable landmarks: .* fix the rotation only to"):
         solve_pnp(PELVIS[few], pixels[few], CAMERA, None, deviations)
+
+
+def test_points_that_lie_close_together_are_no_harm() -> None:
+    """Among the subsets that are tried are then some that OpenCV refuses to solve."""
+    crowd = PELVIS[8] + 0.3 * torch.randn((5, 3), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    points = torch.cat([PELVIS[:6], crowd])
+    truth = pose((3, -4, 2))
+    found = solve_pnp(points, seen(truth, points=points), CAMERA)
+    assert torch.rad2deg(rotation_angle(found.camera_from_object[:3, :3] @ truth[:3, :3].mT)) < 0.01
