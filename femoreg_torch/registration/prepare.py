@@ -58,7 +58,9 @@ def anatomy_objects(
     if max(abs(s - REGISTRATION_SPACING_MM) for s in ct.spacing_mm) > 1e-3:
         labels = resample_isotropic(labels, REGISTRATION_SPACING_MM, nearest=True)
         ct = resample_isotropic(ct, REGISTRATION_SPACING_MM)
-    pelvis, bone = (structure_attenuation(ct, labels, structures[name]) for name in ("pelvis", femur))
+    pelvis, bone = (
+        structure_attenuation(ct, labels, structures[name], offset_hu=SOFT_HU) for name in ("pelvis", femur)
+    )
     always: tuple[Kind, ...] = ("anatomy", "device")
     return {
         "pelvis": RigidObject(pelvis, middle, always, classes=_CLASSES["pelvis"]),

@@ -41,9 +41,7 @@ class Scene:
     images: dict[Kind, tuple[Tensor, ...]]  # attenuation images (H, W), one per view
     segmentations: tuple[Segmentation, ...] = ()  # one per view; none unless a stage weighs its pixels by them
     tissue: Volume | None = None  # attenuation of the soft tissue, 1/mm, in the CT's LPS
-    hips: Volume | None = (
-        None  # 1 inside the hip bones, in the CT's LPS; None if the label map does not tell them apart
-    )
+    hips: Volume | None = None  # 1 inside the hip bones, in the CT's LPS; None where labels do not tell them apart
 
     @property
     def views(self) -> int:

@@ -15,6 +15,7 @@ from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, about_point, exp_se3
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective, minimise
 from femoreg_torch.registration.scene import Segmentation
+from femoreg_torch.registration.weights import dilated
 from femoreg_torch.volume import Volume, resample_isotropic
 
 HIP_CLASSES, FEMUR_CLASSES = (1, 2), (5, 6)  # of the network's segmentation
@@ -98,14 +99,9 @@ def refine_by_silhouette(
 def _looked_at(seen: Segmentation, attenuation: Tensor, camera: Camera) -> Tensor:
     """Pixels (h, w) of the segmentation's grid that are compared."""
     hips, femora = (seen.probabilities[list(classes)].sum(0) > 0.5 for classes in (HIP_CLASSES, FEMUR_CLASSES))
-    near = _dilated(hips, _BAND_MM, seen.camera)
-    hidden = _dilated(femora, _FEMUR_MARGIN_MM, seen.camera)
+    near = dilated(hips, _BAND_MM, seen.camera)
+    hidden = dilated(femora, _FEMUR_MARGIN_MM, seen.camera)
     low, high = attenuation.aminmax()
     extreme = to_network_grid(((attenuation <= low) | (attenuation >= high)).float(), camera)
     covered = F.interpolate(extreme[None, None], seen.camera.shape, mode="area")[0, 0] > 0.5
-    return near & ~hidden & ~_dilated(covered, _FEMUR_MARGIN_MM, seen.camera)
-
-
-def _dilated(mask: Tensor, margin_mm: float, camera: Camera) -> Tensor:
-    radius = round(margin_mm / (sum(camera.pixel_mm) / 2))
-    return F.max_pool2d(mask[None].float(), 2 * radius + 1, 1, radius)[0] > 0.5
+    return near & ~hidden & ~dilated(covered, _FEMUR_MARGIN_MM, seen.camera)

@@ -50,7 +50,7 @@ def pixel_weights(
     if "clear" in weights:
         placed = scene.shown(poses.camera1_from, kind)
         still = [name for name in placed if "anatomy" not in scene.objects[name].shown_in and name not in moving]
-        looked_at &= ~_dilated(_silhouette(scene, poses, still, view, camera, step_mm), _SHADOW_MARGIN_MM, camera)
+        looked_at &= ~dilated(_silhouette(scene, poses, still, view, camera, step_mm), _SHADOW_MARGIN_MM, camera)
     if not looked_at.any():
         raise InputError(
             f"view {view + 1}, {kind} image: weights [{', '.join(weights)}] leave no pixel to compare. Does it show "
@@ -66,7 +66,7 @@ def _bones(scene: Scene, poses: Poses, names: Sequence[str], view: int, camera: 
     classes = sorted({label for name in names for label in scene.objects[name].classes})
     seen = _on_grid(scene.segmentations[view], camera)[classes].sum(0) >= _LEAST_PROBABILITY
     unknown = [name for name in names if not scene.objects[name].classes]
-    return _dilated(seen | _silhouette(scene, poses, unknown, view, camera, step_mm), _BONE_MARGIN_MM, camera)
+    return dilated(seen | _silhouette(scene, poses, unknown, view, camera, step_mm), _BONE_MARGIN_MM, camera)
 
 
 def _on_grid(segmentation: Segmentation, camera: Camera) -> Tensor:
@@ -85,7 +85,7 @@ def _silhouette(scene: Scene, poses: Poses, names: Sequence[str], view: int, cam
     return project([scene.objects[name].volume for name in names], where, camera, step_mm)[0] > _LEAST_SHADOW
 
 
-def _dilated(mask: Tensor, margin_mm: float, camera: Camera) -> Tensor:
+def dilated(mask: Tensor, margin_mm: float, camera: Camera) -> Tensor:
     """The pixels (H, W) that are closer than a margin on the detector, along rows and columns, to those of a mask."""
     rows, columns = (math.ceil(margin_mm / pixel_mm) for pixel_mm in camera.pixel_mm)
     return F.max_pool2d(mask[None].float(), (2 * rows + 1, 2 * columns + 1), 1, (rows, columns))[0] > 0

@@ -42,7 +42,7 @@ def test_the_gradient_is_the_slope_of_the_values_and_the_curvature_is_never_nega
     objective = _joint_objective(Prior(rotation_deg=5, translation_mm=10, weight=0.1), weights, imaging)
     delta = 0.3 * torch.randn(30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     model = objective.quadratic(delta)
-    h = 0.04  # smaller steps drown in the rounding of single precision
+    h = 0.04 if imaging.scatter else 0.02  # with less contrast a small step drowns in single precision
     moved = delta + h * torch.cat([torch.eye(30), -torch.eye(30)]).double()
     values = objective(moved)
     slope = (values[:30] - values[30:]) / (2 * h)
