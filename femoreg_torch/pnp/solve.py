@@ -30,7 +30,7 @@ _SUBSET_SIZES = (4, 5, 6)
 _DEPTHS = (0.2, 1.0)  # of the source-to-detector distance: the object lies between source and detector
 _MIDDLE_DEPTHS = (0.45, 0.95)  # the same for the middle of the points: nobody lies on the tube or touches the detector
 _HUBER_DEVIATIONS = 1.5
-_ROTATION_DEG = 5.0  # greatest standard deviation, over all axes, of a start that is given; chosen on patient 101
+_ROTATION_DEG = 10.0  # greatest standard deviation, over all axes, of a pose that is given
 _STEPS = (0.01, 0.01, 0.01, 1, 1, 10)  # typical sizes of a twist, rad and mm
 _TILT_DEG = 30.0  # prior standard deviation of the beam about the patient's front-to-back axis, each way
 
@@ -64,7 +64,7 @@ def solve_pnp(
     chance.
 
     Raises `InputError` "too few usable landmarks …" when fewer than four, or fewer than half of the points, agree, or
-    if by `deviations_px` the rotation is uncertain by more than 5°.
+    if by `deviations_px` the rotation is uncertain by more than 10°.
     """
     weights = torch.ones(len(points)) if weights is None else weights
     _check(points, pixels, weights, deviations_px)

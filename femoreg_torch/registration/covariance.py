@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from femoreg_torch.registration.objective import Level, image_costs, stage_objective
+from femoreg_torch.registration.objective import PLAIN, Imaging, Level, image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, reference_point_in_view
 
 _UNIT_DEG, _UNIT_MM = 1.0, 1.0
@@ -40,15 +40,15 @@ class PoseCovariance:
         return sigma[:3], sigma[3:]
 
 
-def pose_covariance(scene: Scene, poses: Poses, level: Level) -> PoseCovariance:
-    """The covariance of all poses at a solution, from the images of every view at one level."""
+def pose_covariance(scene: Scene, poses: Poses, level: Level, imaging: Imaging = PLAIN) -> PoseCovariance:
+    """The covariance of all poses at a solution, from the images of every view at one level, drawn with `imaging`."""
     scale = torch.tensor([_UNIT_DEG * torch.pi / 180] * 3 + [_UNIT_MM] * 3, dtype=torch.float64)
     objects = tuple(poses.camera1_from)
     bodies = [Body((name,), 0, reference_point_in_view(scene, poses, name, 0), scale) for name in objects]
     others = range(1, len(poses.camera_from_camera1))
     bodies += [Body((), view, reference_point_in_view(scene, poses, objects[0], view), scale) for view in others]
     images: list[tuple[Kind, int]] = [(kind, view) for kind in scene.images for view in (0, *others)]
-    costs = image_costs(scene, poses, tuple(bodies), objects, images, level)
+    costs = image_costs(scene, poses, tuple(bodies), objects, images, level, imaging=imaging)
     model = stage_objective(costs, tuple(bodies), None).quadratic(torch.zeros(6 * len(bodies), dtype=torch.float64))
     inverse = torch.linalg.pinv(model.hessian, hermitian=True)
     clusters = len(model.scores) / (len(model.scores) - 1)

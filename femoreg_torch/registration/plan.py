@@ -91,6 +91,11 @@ class Plan:
         """Whether a stage weighs pixels by what the network sees in every view."""
         return any(isinstance(step, Stage) and "bones" in step.weights for step in self.steps)
 
+    @property
+    def imaging(self) -> Imaging:
+        """What the last stage takes the images to be."""
+        return next((step.imaging for step in reversed(self.steps) if isinstance(step, Stage)), PLAIN)
+
 
 def load_plan(preset: str) -> Plan:
     """The workflow `configs/registration/<preset>.yaml`. Raises `InputError` that names preset, step and key."""

@@ -13,7 +13,7 @@ import torch
 
 from femoreg_torch.geometry import invert_rigid
 from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
-from femoreg_torch.registration.objective import Level, image_costs
+from femoreg_torch.registration.objective import PLAIN, Imaging, Level, image_costs
 from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, reference_point_in_view
 
 _LEVEL = Level(downsample=8, step_mm=0.5, patch_radius=5)
@@ -52,15 +52,17 @@ class ObjectQuality:
     reason: str
 
 
-def assess(scene: Scene, poses: Poses, limits: Limits) -> dict[str, ObjectQuality]:
-    """Quality of every object placed in `poses`, in the first kind of images that shows it."""
-    covariance = pose_covariance(scene, poses, _LEVEL)
-    return {name: _assess_object(scene, poses, name, covariance, limits) for name in poses.camera1_from}
+def assess(scene: Scene, poses: Poses, limits: Limits, imaging: Imaging = PLAIN) -> dict[str, ObjectQuality]:
+    """Quality of every object placed in `poses`, in the first kind of images that shows it, drawn with `imaging`."""
+    covariance = pose_covariance(scene, poses, _LEVEL, imaging)
+    return {name: _assess_object(scene, poses, name, covariance, limits, imaging) for name in poses.camera1_from}
 
 
-def _assess_object(scene: Scene, poses: Poses, name: str, covariance: PoseCovariance, limits: Limits) -> ObjectQuality:
+def _assess_object(
+    scene: Scene, poses: Poses, name: str, covariance: PoseCovariance, limits: Limits, imaging: Imaging
+) -> ObjectQuality:
     kind = scene.objects[name].shown_in[0]
-    views = tuple(_assess_view(scene, poses, name, kind, view) for view in range(len(scene.images[kind])))
+    views = tuple(_assess_view(scene, poses, name, (kind, view), imaging) for view in range(len(scene.images[kind])))
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
     rotation, translation = covariance.deviations(name)
@@ -90,7 +92,8 @@ def _reason(name: str, views: Sequence[ViewQuality], limits: Limits) -> str | No
     return None
 
 
-def _assess_view(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> ViewQuality:
+def _assess_view(scene: Scene, poses: Poses, name: str, image: tuple[Kind, int], imaging: Imaging) -> ViewQuality:
+    kind, view = image
     here = poses.camera_from_camera1[view]
     # The same geometry with this view as the frame that all else is tied to, so that a delta acts along its axes.
     local = Poses(
@@ -101,9 +104,10 @@ def _assess_view(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -
     body = Body((name,), 0, centre, scale)
     drawn = scene.shown(poses.camera1_from, kind)
     probes = torch.tensor([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=torch.float64)
-    costs = image_costs(scene, local, (body,), drawn, [(kind, view)], _LEVEL)(probes)[:, 0].tolist()
+    costs = image_costs(scene, local, (body,), drawn, [image], _LEVEL, imaging=imaging)(probes)[:, 0].tolist()
     others = [n for n in drawn if n != name]
-    without = image_costs(scene, local, (), others, [(kind, view)], _LEVEL)(torch.zeros(1, 0, dtype=torch.float64))
+    nothing = torch.zeros(1, 0, dtype=torch.float64)
+    without = image_costs(scene, local, (), others, [image], _LEVEL, imaging=imaging)(nothing)
     pull = (_minimum(costs[1], costs[0], costs[2]) * _PROBE_MM, _minimum(costs[3], costs[0], costs[4]) * _PROBE_MM)
     return ViewQuality(view + 1, 1 - costs[0], float(without[0, 0]) - costs[0], pull)
 

@@ -59,7 +59,7 @@ def sabotaged_runs(cases: Sequence[Path], plan: Plan, starts: int) -> list[dict[
                 objects = {**scene.objects, "device": replace(scene.objects["device"], camera1_from=device)}
                 wrong = replace(scene, objects=objects)
                 poses = run_plan(wrong, plan, pelvis, start, lambda *_: None).poses
-                quality = assess(wrong, poses, Limits())
+                quality = assess(wrong, poses, Limits(), plan.imaging)
                 record = {
                     "sabotage": sabotage.name,
                     "case": folder.name,
