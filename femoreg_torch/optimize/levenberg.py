@@ -1,6 +1,6 @@
 """Levenberg–Marquardt: steps of second order, damped until they improve; from one start or from the best of many."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -38,19 +38,23 @@ def minimise_levenberg_marquardt(objective: SmoothObjective, n: int, settings: L
         drawn = torch.randn(settings.candidates, n, generator=generator, dtype=torch.float64)
         tried = torch.cat([starts, drawn])
         starts = tried[track(tried).argsort()[: settings.starts]]
-    best = None
-    for start in starts:
-        found = _descend(track, objective, start, settings)
-        if best is None or found[1] < best[1]:
-            best = found
-    assert best is not None  # there is always one start
-    return track.result(best[0])
+    found = [_descend(track, objective, start, settings) for start in starts]
+    best = min(found, key=lambda end: end.value)
+    ends = tuple((end.value, tuple(end.delta.tolist())) for end in found) if len(found) > 1 else ()
+    return replace(track.result(best.stop), ends=ends)
 
 
-def _descend(
-    track: BestSoFar, objective: SmoothObjective, start: torch.Tensor, settings: LevenbergMarquardt
-) -> tuple[Stop, float]:
-    """Why a descent from one start stopped, and the value it came to."""
+@dataclass(frozen=True, eq=False)
+class _End:
+    """Where a descent ended, and why."""
+
+    stop: Stop
+    value: float
+    delta: torch.Tensor  # (n,)
+
+
+def _descend(track: BestSoFar, objective: SmoothObjective, start: torch.Tensor, settings: LevenbergMarquardt) -> _End:
+    """Where a descent from one start leads."""
     here, model = start, _quadratic(track, objective, start)
     damping, growth = _DAMPING, 2.0
     for _ in range(settings.max_iterations):
@@ -61,9 +65,9 @@ def _descend(
         step = -torch.linalg.solve(damped, model.gradient)
         promised = float(-(model.gradient @ step) - 0.5 * step @ model.hessian @ step)
         if float(step.norm()) < settings.tol_x:
-            return Stop.SMALL_STEP, model.value
+            return _End(Stop.SMALL_STEP, model.value, here)
         if promised < settings.tol_f:
-            return Stop.FLAT, model.value
+            return _End(Stop.FLAT, model.value, here)
         trial = _quadratic(track, objective, here + step)
         ratio = (model.value - trial.value) / promised
         if ratio > 0:
@@ -73,8 +77,8 @@ def _descend(
         else:
             damping, growth = damping * growth, growth * 2
             if damping > _MOST_DAMPING:
-                return Stop.ROUNDOFF, model.value
-    return Stop.BUDGET, model.value
+                return _End(Stop.ROUNDOFF, model.value, here)
+    return _End(Stop.BUDGET, model.value, here)
 
 
 def _quadratic(track: BestSoFar, objective: SmoothObjective, delta: torch.Tensor) -> Quadratic:

@@ -22,7 +22,8 @@ class Stop(Enum):
 class Result:
     """Outcome of one optimisation.
 
-    `delta` (n,) is in units of the scales. `trace` holds (evaluations, best value, best delta) at every improvement.
+    `delta` (n,) is in units of the scales. `trace` holds (evaluations, best value, best delta) at every improvement,
+    `ends` (value, delta) where each start ended, if there were several.
     """
 
     delta: Tensor
@@ -30,6 +31,7 @@ class Result:
     stop: Stop
     evaluations: int
     trace: tuple[tuple[int, float, tuple[float, ...]], ...]
+    ends: tuple[tuple[float, tuple[float, ...]], ...] = ()
 
 
 class BestSoFar:

@@ -1,9 +1,10 @@
 """Can a registration be trusted? Asked of every object in every view, without knowing the truth.
 
-Three signs of a wrong pose are measured at the solution. First, what the image gains when the object is drawn: a bone
+Signs of a wrong pose are measured at the solution. First, what the image gains when the object is drawn: a bone
 or a device that is not where it is drawn explains little of the image. Second, where each view by itself would move the
 object in its own image plane: views that pull in different directions contradict each other, or their common geometry.
-Third, the standard deviations of the pose (`registration.covariance`), depth included.
+Third, the standard deviations of the pose (`registration.covariance`), depth included. Fourth, how far it lies from
+where it was expected. Fifth, whether other starts of a stage ended elsewhere and fitted as well.
 """
 
 from collections.abc import Sequence
@@ -11,10 +12,11 @@ from dataclasses import dataclass
 
 import torch
 
-from femoreg_torch.geometry import invert_rigid
+from femoreg_torch.geometry import invert_rigid, rotation_angle, transform_points
 from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
 from femoreg_torch.registration.objective import PLAIN, Imaging, Level, image_costs
 from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, reference_point_in_view
+from femoreg_torch.registration.workflow import StepTrace
 
 _LEVEL = Level(downsample=8, step_mm=0.5, patch_radius=5)
 _PROBE_MM = 0.6  # about half a pixel of the level, at the object
@@ -28,6 +30,10 @@ class Limits:
     most_pull_mm: float = 1.5  # of a single view in its image plane
     most_deviation_mm: float = 1.0  # standard deviation along any axis
     most_deviation_deg: float = 0.6  # and about any axis
+    rival_cost: float = 0.005  # another start of a stage that ended so little above the best,
+    rival_deg: float = 5.0  # but so far away
+    rival_mm: float = 30.0  # or so far, is a rival; depth is open by some 20 mm where one coarse image is looked at
+    most_displacement_mm: float = 8.0  # of an object of the CT beside the first one; joints do not gape so far
 
 
 @dataclass(frozen=True)
@@ -48,27 +54,67 @@ class ObjectQuality:
     in_plane_uncertainty_mm: float  # root mean square disagreement of the views in their image planes
     rotation_deviation_deg: tuple[float, ...]  # standard deviations about the axes of camera 1
     translation_deviation_mm: tuple[float, ...]  # and along them, of the reference point
+    displacement: tuple[float, float] | None  # degrees, mm from where it was expected, at the reference point
     trusted: bool
     reason: str
 
 
-def assess(scene: Scene, poses: Poses, limits: Limits, imaging: Imaging = PLAIN) -> dict[str, ObjectQuality]:
-    """Quality of every object placed in `poses`, in the first kind of images that shows it, drawn with `imaging`."""
+def assess(
+    scene: Scene, poses: Poses, limits: Limits, imaging: Imaging = PLAIN, trace: Sequence[StepTrace] = ()
+) -> dict[str, ObjectQuality]:
+    """Quality of every object placed in `poses`, in the first kind of images that shows it, drawn with `imaging`.
+
+    `trace` is that of the steps which led there.
+    """
     covariance = pose_covariance(scene, poses, _LEVEL, imaging)
-    return {name: _assess_object(scene, poses, name, covariance, limits, imaging) for name in poses.camera1_from}
+    return {name: _assess_object(scene, poses, name, covariance, limits, imaging, trace) for name in poses.camera1_from}
 
 
 def _assess_object(
-    scene: Scene, poses: Poses, name: str, covariance: PoseCovariance, limits: Limits, imaging: Imaging
+    scene: Scene,
+    poses: Poses,
+    name: str,
+    covariance: PoseCovariance,
+    limits: Limits,
+    imaging: Imaging,
+    trace: Sequence[StepTrace],
 ) -> ObjectQuality:
     kind = scene.objects[name].shown_in[0]
     views = tuple(_assess_view(scene, poses, name, (kind, view), imaging) for view in range(len(scene.images[kind])))
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
     rotation, translation = covariance.deviations(name)
-    reason = _reason(name, views, limits) or _vague(name, rotation, translation, limits)
-    agreed = reason or "all views agree"
-    return ObjectQuality(views, uncertainty, tuple(rotation), tuple(translation), reason is None, agreed)
+    displacement = _displacement(scene, poses, name)
+    reason = (
+        _reason(name, views, limits)
+        or _vague(name, rotation, translation, limits)
+        or _out_of_joint(scene, name, displacement, limits)
+        or _rivalled(name, trace, limits)
+    )
+    told = reason or "all views agree"
+    return ObjectQuality(views, uncertainty, tuple(rotation), tuple(translation), displacement, reason is None, told)
+
+
+def _displacement(scene: Scene, poses: Poses, name: str) -> tuple[float, float] | None:
+    """How far an object lies from its nominal pose, or from where the CT has it beside its first object."""
+    expected = scene.objects[name].camera1_from
+    if expected is None:
+        first = next(other for other in poses.camera1_from if scene.objects[other].camera1_from is None)
+        if name == first:
+            return None
+        expected = poses.camera1_from[first]
+    found = poses.camera1_from[name]
+    point = scene.objects[name].reference_point[None]
+    shift = transform_points(found, point) - transform_points(expected, point)
+    return float(torch.rad2deg(rotation_angle(expected[:3, :3].mT @ found[:3, :3]))), float(shift.norm())
+
+
+def _out_of_joint(scene: Scene, name: str, displacement: tuple[float, float] | None, limits: Limits) -> str | None:
+    if displacement is None or scene.objects[name].camera1_from is not None:
+        return None  # nothing joins a device to the patient
+    if displacement[1] <= limits.most_displacement_mm:
+        return None
+    return f"the {name} lies {displacement[1]:.1f} mm from where the CT has it"
 
 
 def _vague(name: str, rotation: Sequence[float], translation: Sequence[float], limits: Limits) -> str | None:
@@ -89,6 +135,17 @@ def _reason(name: str, views: Sequence[ViewQuality], limits: Limits) -> str | No
             return f"view {view.view} would move the {name} by ({x:.1f}, {y:.1f}) mm in its image plane"
         if view.gain < limits.least_gain:
             return f"drawing the {name} in view {view.view} explains hardly more of the image (gain {view.gain:.4f})"
+    return None
+
+
+def _rivalled(name: str, trace: Sequence[StepTrace], limits: Limits) -> str | None:
+    for step in trace:
+        for end in step.restarts if name in step.moving else ():
+            if end.cost < limits.rival_cost and (end.apart_deg > limits.rival_deg or end.apart_mm > limits.rival_mm):
+                return (
+                    f"in the stage “{step.name}” a pose {end.apart_deg:.0f}° and {end.apart_mm:.0f} mm away fitted "
+                    f"nearly as well (cost {end.cost:.4f} higher)"
+                )
     return None
 
 

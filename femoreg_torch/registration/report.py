@@ -52,6 +52,7 @@ def result_content(
                 "cost": entry.value,
                 "evaluations": entry.evaluations,
                 "seconds": entry.seconds,
+                "restarts": [asdict(restart) for restart in entry.restarts],
                 "stop": entry.result.stop.value if entry.result else "all angles tried",
                 "camera_from_camera1": entry.poses.camera_from_camera1,
                 "camera1_from": entry.poses.camera1_from,

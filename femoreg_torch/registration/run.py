@@ -41,7 +41,7 @@ def register_by_plan(case: Case, plan: Plan, seed: int, find: Detector, report: 
     clock["started"] = time.perf_counter()
     outcome = run_plan(scene, plan, camera1_from_pelvis, seed, report)
     clock["registered"] = time.perf_counter()
-    quality = assess(scene, outcome.poses, Limits(), plan.imaging)
+    quality = assess(scene, outcome.poses, Limits(), plan.imaging, outcome.trace)
     done = time.perf_counter()
     timings = {
         "reading": clock["prepared"] - clock["began"],

@@ -15,6 +15,7 @@ from femoreg_torch.optimize import Result, minimise
 from femoreg_torch.registration.moments import Moment, moments_of
 from femoreg_torch.registration.objective import image_costs, stage_objective
 from femoreg_torch.registration.plan import VIEW, VIEWS, BodyPlan, OrbitSearch, Plan, Stage
+from femoreg_torch.registration.restarts import Restart, restarts_of
 from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, moved, reference_point_in_view
 from femoreg_torch.similarity import grad_ncc
 
@@ -33,6 +34,8 @@ class StepTrace:
     evaluations: int
     seconds: float
     moments: tuple[Moment, ...] = ()  # along the optimisation, for the replay
+    restarts: tuple[Restart, ...] = ()  # where its other starts ended
+    moving: tuple[str, ...] = ()  # the objects that it moved, all of them with a C-arm
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +107,11 @@ def run_stage(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], 
     seconds = time.perf_counter() - began
     after = moved(poses, bodies, result.delta)
     moments = moments_of(result, lambda delta: moved(poses, bodies, delta))
-    return StepTrace(stage.name, view, after, result, result.value, result.evaluations, seconds, moments)
+    restarts = restarts_of(result, scene, bodies, lambda delta: moved(poses, bodies, delta))
+    turned = any(body.view for body in bodies)
+    moving = tuple(poses.camera1_from) if turned else tuple(name for body in bodies for name in body.objects)
+    evaluations = result.evaluations
+    return StepTrace(stage.name, view, after, result, result.value, evaluations, seconds, moments, restarts, moving)
 
 
 def _bodies(scene: Scene, poses: Poses, plan: BodyPlan, views: tuple[int, ...]) -> list[Body]:

@@ -58,14 +58,14 @@ def sabotaged_runs(cases: Sequence[Path], plan: Plan, starts: int) -> list[dict[
                 device = displaced(true, centres["device"], sabotage.device, generator)
                 objects = {**scene.objects, "device": replace(scene.objects["device"], camera1_from=device)}
                 wrong = replace(scene, objects=objects)
-                poses = run_plan(wrong, plan, pelvis, start, lambda *_: None).poses
-                quality = assess(wrong, poses, Limits(), plan.imaging)
+                outcome = run_plan(wrong, plan, pelvis, start, lambda *_: None)
+                quality = assess(wrong, outcome.poses, Limits(), plan.imaging, outcome.trace)
                 record = {
                     "sabotage": sabotage.name,
                     "case": folder.name,
                     "start": start,
                     "refused": None,
-                    "errors": errors(case.truth, _truth(poses), points),
+                    "errors": errors(case.truth, _truth(outcome.poses), points),
                     "quality": {name: asdict(value) for name, value in quality.items()},
                     "trusted": all(value.trusted for value in quality.values()),
                 }

@@ -44,6 +44,9 @@ def test_one_start_stays_in_its_valley_and_the_best_of_many_does_not() -> None:
     scattered = minimise(squares(waves), 2, LevenbergMarquardt(candidates=200, starts=40), seed=0)
     assert alone.value > 0.05
     torch.testing.assert_close(scattered.delta, torch.tensor([2.0, -1.0], dtype=torch.float64), atol=1e-3, rtol=0)
+    assert alone.ends == ()
+    assert len(scattered.ends) == 40
+    assert min(value for value, _ in scattered.ends) == pytest.approx(scattered.value)
 
 
 def test_scales_of_very_different_stiffness_do_not_matter() -> None:

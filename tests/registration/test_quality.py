@@ -1,11 +1,15 @@
 """Trust: given at the truth, withheld where a pose is wrong or an object cannot be seen."""
 
+from dataclasses import replace
+
 import pytest
 from registration_scenes import REFERENCE_POINTS, float64, make_scene, off, true_poses
 
 from femoreg_torch.registration import Scene, quality
 from femoreg_torch.registration.objective import Level
 from femoreg_torch.registration.quality import Limits, assess
+from femoreg_torch.registration.restarts import Restart
+from femoreg_torch.registration.workflow import StepTrace
 
 TRUTH = true_poses()
 LIMITS = Limits()
@@ -47,3 +51,35 @@ def test_an_object_outside_the_image_is_not(scene: Scene) -> None:
 def test_a_wrong_view_is_noticed(scene: Scene) -> None:
     wrong = off(TRUTH.camera_from_camera1[1], float64(0, 0, 740), (0, 2, 0), (5, 0, 0))
     assert not assess(scene, TRUTH.with_view(1, wrong), LIMITS)["pelvis"].trusted
+
+
+def test_displacement_is_told_from_the_nominal_pose_and_from_the_place_in_the_ct(scene: Scene) -> None:
+    """The femur is turned about its head by about 11°, the device is nominal at the truth."""
+    nominal = replace(scene.objects["device"], camera1_from=TRUTH.camera1_from["device"])
+    known = replace(scene, objects={**scene.objects, "device": nominal})
+    moved = off(TRUTH.camera1_from["device"], REFERENCE_POINTS["device"], (0, 0.5, 0), (0, 0, 1.0))
+    found = assess(known, TRUTH.with_object("device", moved), LIMITS)
+    assert found["pelvis"].displacement is None
+    assert found["femur"].displacement == pytest.approx((11.2, 0), abs=0.1)
+    assert found["device"].displacement == pytest.approx((0.5, 1.0), abs=1e-4)
+
+
+def test_a_femur_out_of_its_joint_is_not_trusted(scene: Scene) -> None:
+    """Even if every image agreed with it."""
+    apart = off(TRUTH.camera1_from["femur"], REFERENCE_POINTS["femur"], (0, 0, 0), (0, 0, 9))
+    blind = Limits(least_gain=-1, most_pull_mm=1e6, most_deviation_mm=1e6, most_deviation_deg=1e6)
+    found = assess(scene, TRUTH.with_object("femur", apart), blind)
+    assert found["pelvis"].trusted
+    assert found["femur"].reason == "the femur lies 9.0 mm from where the CT has it"
+
+
+@pytest.mark.parametrize(
+    ("cost", "apart_deg", "trusted"), [(0.001, 12.0, False), (0.05, 12.0, True), (0.001, 1.0, True)]
+)
+def test_a_rival_that_fits_as_well_is_a_doubt(scene: Scene, cost: float, apart_deg: float, trusted: bool) -> None:
+    rival = Restart(cost, apart_deg, 3.0)
+    step = StepTrace("femur in view 1", None, TRUTH, None, 0.4, 100, 1.0, restarts=(rival,), moving=("femur",))
+    found = assess(scene, TRUTH, LIMITS, trace=(step,))
+    assert found["pelvis"].trusted
+    assert found["femur"].trusted is trusted
+    assert trusted or "femur in view 1" in found["femur"].reason

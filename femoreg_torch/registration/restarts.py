@@ -1,0 +1,41 @@
+"""Do the starts of an optimisation agree? Another end that fits as well makes the best one doubtful."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.geometry import rotation_angle
+from femoreg_torch.optimize import Result
+from femoreg_torch.registration.scene import Body, Poses, Scene, reference_point_in_view
+
+
+@dataclass(frozen=True)
+class Restart:
+    """Where one start of an optimisation ended, against the best end of all."""
+
+    cost: float  # above the best
+    apart_deg: float  # the greatest over all that the stage moves
+    apart_mm: float  # of the reference point
+
+
+def restarts_of(
+    result: Result, scene: Scene, bodies: Sequence[Body], poses_after: Callable[[Tensor], Poses]
+) -> tuple[Restart, ...]:
+    """The ends of all starts but the best, the best of them first; none of an optimiser that has one start."""
+    ends = sorted(result.ends)
+    places = [poses_after(torch.tensor(delta, dtype=torch.float64)) for _, delta in ends]
+    found = []
+    for (cost, _), place in zip(ends[1:], places[1:], strict=True):
+        apart = [_apart(scene, body, places[0], place) for body in bodies]
+        found.append(Restart(cost - ends[0][0], max(deg for deg, _ in apart), max(mm for _, mm in apart)))
+    return tuple(found)
+
+
+def _apart(scene: Scene, body: Body, first: Poses, second: Poses) -> tuple[float, float]:
+    """Degrees and mm between two poses of what a body moves, in the camera that it moves in."""
+    name = next(iter(body.objects or first.camera1_from))
+    turned = first.camera_from(name)[body.view, :3, :3].mT @ second.camera_from(name)[body.view, :3, :3]
+    points = [reference_point_in_view(scene, poses, name, body.view) for poses in (first, second)]
+    return float(torch.rad2deg(rotation_angle(turned))), float((points[0] - points[1]).norm())
