@@ -28,6 +28,7 @@ class PoseCovariance:
 
     bodies: tuple[str, ...]  # object names, then "view 2", …
     matrix: Tensor
+    step: Tensor  # (6 B,): where all images together would move the bodies, were all free; 0 at their common optimum
 
     def of(self, first: str, second: str | None = None) -> Tensor:
         """The block (6, 6) of one body, or of two."""
@@ -38,6 +39,11 @@ class PoseCovariance:
         """Standard deviations of one body: rotation (3) in degrees, translation (3) in mm."""
         sigma = self.of(name).diagonal().sqrt().tolist()
         return sigma[:3], sigma[3:]
+
+    def pull(self, name: str) -> tuple[float, float]:
+        """Degrees and mm that all images together would move one body by, were all bodies free."""
+        i = 6 * self.bodies.index(name)
+        return float(self.step[i : i + 3].norm()), float(self.step[i + 3 : i + 6].norm())
 
 
 def pose_covariance(scene: Scene, poses: Poses, level: Level, imaging: Imaging = PLAIN) -> PoseCovariance:
@@ -53,4 +59,4 @@ def pose_covariance(scene: Scene, poses: Poses, level: Level, imaging: Imaging =
     inverse = torch.linalg.pinv(model.hessian, hermitian=True)
     clusters = len(model.scores) / (len(model.scores) - 1)
     matrix = clusters * inverse @ (model.scores.T @ model.scores) @ inverse
-    return PoseCovariance((*objects, *(f"view {view + 1}" for view in others)), matrix)
+    return PoseCovariance((*objects, *(f"view {view + 1}" for view in others)), matrix, -inverse @ model.gradient)

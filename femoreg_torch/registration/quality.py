@@ -3,8 +3,9 @@
 Signs of a wrong pose are measured at the solution. First, what the image gains when the object is drawn: a bone
 or a device that is not where it is drawn explains little of the image. Second, where each view by itself would move the
 object in its own image plane: views that pull in different directions contradict each other, or their common geometry.
-Third, the standard deviations of the pose (`registration.covariance`), depth included. Fourth, how far it lies from
-where it was expected. Fifth, whether other starts of a stage ended elsewhere and fitted as well.
+Third, where all views together would move it, were everything free: what a stage held in a wrong place, the C-arm, say,
+moves then. Fourth, the standard deviations of the pose (`registration.covariance`), depth included. Fifth, how far it
+lies from where it was expected. Sixth, whether other starts of a stage ended elsewhere and fitted as well.
 """
 
 from collections.abc import Sequence
@@ -28,11 +29,13 @@ class Limits:
 
     least_gain: float = 0.004  # of mean patch NCC, when the object is drawn
     most_pull_mm: float = 1.5  # of a single view in its image plane
+    most_common_pull_mm: float = 2.0  # of all images together, were all that is registered free to move
+    most_common_pull_deg: float = 1.0
     most_deviation_mm: float = 1.0  # standard deviation along any axis
     most_deviation_deg: float = 0.6  # and about any axis
     rival_cost: float = 0.005  # another start of a stage that ended so little above the best,
-    rival_deg: float = 5.0  # but so far away
-    rival_mm: float = 30.0  # or so far, is a rival; depth is open by some 20 mm where one coarse image is looked at
+    rival_deg: float = 15.0  # but so far away
+    rival_mm: float = 50.0  # or so far, is a rival; what is nearer, the following stages tell apart
     most_displacement_mm: float = 8.0  # of an object of the CT beside the first one; joints do not gape so far
 
 
@@ -52,6 +55,7 @@ class ObjectQuality:
 
     views: tuple[ViewQuality, ...]
     in_plane_uncertainty_mm: float  # root mean square disagreement of the views in their image planes
+    common_pull: tuple[float, float]  # degrees, mm: where all images together would move it, were all free
     rotation_deviation_deg: tuple[float, ...]  # standard deviations about the axes of camera 1
     translation_deviation_mm: tuple[float, ...]  # and along them, of the reference point
     displacement: tuple[float, float] | None  # degrees, mm from where it was expected, at the reference point
@@ -84,15 +88,19 @@ def _assess_object(
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
     rotation, translation = covariance.deviations(name)
+    pull = covariance.pull(name)
     displacement = _displacement(scene, poses, name)
     reason = (
         _reason(name, views, limits)
+        or _unsettled(name, pull, limits)
         or _vague(name, rotation, translation, limits)
         or _out_of_joint(scene, name, displacement, limits)
         or _rivalled(name, trace, limits)
     )
     told = reason or "all views agree"
-    return ObjectQuality(views, uncertainty, tuple(rotation), tuple(translation), displacement, reason is None, told)
+    return ObjectQuality(
+        views, uncertainty, pull, tuple(rotation), tuple(translation), displacement, reason is None, told
+    )
 
 
 def _displacement(scene: Scene, poses: Poses, name: str) -> tuple[float, float] | None:
@@ -115,6 +123,13 @@ def _out_of_joint(scene: Scene, name: str, displacement: tuple[float, float] | N
     if displacement[1] <= limits.most_displacement_mm:
         return None
     return f"the {name} lies {displacement[1]:.1f} mm from where the CT has it"
+
+
+def _unsettled(name: str, pull: tuple[float, float], limits: Limits) -> str | None:
+    """A stage that held something in a wrong place leaves the images pulling; nan counts as that."""
+    if pull[0] <= limits.most_common_pull_deg and pull[1] <= limits.most_common_pull_mm:
+        return None
+    return f"all images together would move the {name} by {pull[0]:.1f}° and {pull[1]:.1f} mm, were all else free"
 
 
 def _vague(name: str, rotation: Sequence[float], translation: Sequence[float], limits: Limits) -> str | None:
