@@ -29,8 +29,8 @@ class Limits:
 
     least_gain: float = 0.004  # of mean patch NCC, when the object is drawn
     most_pull_mm: float = 1.5  # of a single view in its image plane
-    most_common_pull_mm: float = 2.0  # of all images together, were all that is registered free to move
-    most_common_pull_deg: float = 1.0
+    most_common_pull_mm: float = 1.0  # of all images together, were all that is registered free to move
+    most_common_pull_deg: float = 0.6
     most_deviation_mm: float = 1.0  # standard deviation along any axis
     most_deviation_deg: float = 0.6  # and about any axis
     rival_cost: float = 0.005  # another start of a stage that ended so little above the best,

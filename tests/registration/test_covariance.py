@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from registration_scenes import REFERENCE_POINTS, make_scene, true_poses
+from registration_scenes import REFERENCE_POINTS, make_scene, off, true_poses
 
 from femoreg_torch.geometry import log_so3
 from femoreg_torch.optimize import LevenbergMarquardt, minimise
@@ -50,3 +50,16 @@ def test_the_prediction_is_of_the_size_of_the_spread(solutions: tuple[list[Poses
         # Five samples know a deviation to a third; depth varies with what else is fitted.
         print(name, ratio)
         assert 0.4 < ratio.log().mean().exp() < 2.5, (name, ratio)
+
+
+def test_a_device_held_in_a_wrong_place_is_pulled_back(solutions: tuple[list[Poses], PoseCovariance]) -> None:
+    """The step of second order leads back to where the images agree, and leaves the pelvis where it is."""
+    found, settled = solutions
+    scene = make_scene(true_poses(), seed=0, noise=0.02)
+    wrong = off(found[0].camera1_from["device"], REFERENCE_POINTS["device"], (0, 0, 0), (0.4, -0.3, 0))
+    pulled = pose_covariance(scene, found[0].with_object("device", wrong), _LEVEL)
+    first = 6 * settled.bodies.index("device") + 3
+    back = (pulled.step - settled.step)[first : first + 2]
+    torch.testing.assert_close(back, torch.tensor([-0.4, 0.3], dtype=torch.float64), atol=0.15, rtol=0)
+    assert pulled.pull("device")[1] > settled.pull("device")[1]
+    assert pulled.pull("pelvis")[1] < 0.15

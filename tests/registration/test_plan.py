@@ -65,9 +65,10 @@ def test_the_wide_preset_is_fast_with_two_more_searches_for_the_device() -> None
 
 
 def test_the_fiducial_preset_finds_the_views_by_the_device_alone() -> None:
-    steps = load_plan("device_fiducial").steps
+    *steps, last, finest = load_plan("device_fiducial").steps
+    assert (last, finest) == load_plan("fast").steps[-2:]
     by_device = [step for step in steps if step.render == ["device"]]
-    assert list(steps[: len(by_device)]) == by_device
+    assert steps[: len(by_device)] == by_device
     assert [step.kind for step in steps if isinstance(step, OrbitSearch)] == ["device"]
     moving = [step for step in steps if isinstance(step, Stage) for b in step.bodies if b.move in (["view"], ["views"])]
     assert moving
