@@ -142,6 +142,13 @@ def rotation_angle(rotation: Tensor) -> Tensor:
     return 2 * torch.atan2(q[..., 1:].norm(dim=-1), q[..., 0])
 
 
+def pose_difference(first: Tensor, second: Tensor, point: Tensor) -> tuple[float, float]:
+    """Degrees between two poses (4, 4) of an object, and mm between the places they give to its `point` (3,)."""
+    turned = torch.rad2deg(rotation_angle(first[:3, :3].mT @ second[:3, :3]))
+    shift = transform_points(second, point[None]) - transform_points(first, point[None])
+    return float(turned), float(shift.norm())
+
+
 def check_rigid(transform: Tensor, where: str, tolerance: float = 1e-4) -> Tensor:
     """`transform` itself if it is a 4×4 rigid transform without reflection, else an `InputError` that names `where`."""
     if transform.shape != (4, 4):

@@ -44,6 +44,11 @@ class PnpResult:
     rms_px: float  # distance of the inliers from their landmarks
     covariance: Tensor  # (6, 6) of (rotation in rad, translation in mm), camera axes, about the used points' centroid
 
+    @property
+    def rotation_deviation_deg(self) -> float:
+        """Standard deviation of the rotation, over all axes."""
+        return float(torch.rad2deg(self.covariance[:3, :3].trace().sqrt()))
+
 
 def solve_pnp(
     points: Tensor,
@@ -89,14 +94,15 @@ def solve_pnp(
             f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree on a pose, but at least {MINIMUM} "
             "and half of them must. Take a view that shows more of the pelvis, or give the landmarks by hand."
         )
-    rotation_deg = float(torch.rad2deg(covariance[:3, :3].trace().sqrt()))
-    if deviations_px is not None and rotation_deg > _ROTATION_DEG:
+    distances = _distances(pose, points, pixels, camera)[inliers]
+    result = PnpResult(pose, torch.from_numpy(inliers), float(np.sqrt((distances**2).mean())), covariance)
+    if deviations_px is not None and result.rotation_deviation_deg > _ROTATION_DEG:
         raise InputError(
             f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree, but they fix the rotation only to "
-            f"{rotation_deg:.0f}°. Take a view that shows more of the pelvis, or give the landmarks by hand."
+            f"{result.rotation_deviation_deg:.0f}°. Take a view that shows more of the pelvis, or give the landmarks "
+            "by hand."
         )
-    distances = _distances(pose, points, pixels, camera)[inliers]
-    return PnpResult(pose, torch.from_numpy(inliers), float(np.sqrt((distances**2).mean())), covariance)
+    return result
 
 
 def _spread_px(

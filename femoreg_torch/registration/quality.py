@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import torch
 
-from femoreg_torch.geometry import invert_rigid, rotation_angle, transform_points
+from femoreg_torch.geometry import invert_rigid, pose_difference
 from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
 from femoreg_torch.registration.objective import PLAIN, Imaging, Level, image_costs
 from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, reference_point_in_view
@@ -111,10 +111,7 @@ def _displacement(scene: Scene, poses: Poses, name: str) -> tuple[float, float] 
         if name == first:
             return None
         expected = poses.camera1_from[first]
-    found = poses.camera1_from[name]
-    point = scene.objects[name].reference_point[None]
-    shift = transform_points(found, point) - transform_points(expected, point)
-    return float(torch.rad2deg(rotation_angle(expected[:3, :3].mT @ found[:3, :3]))), float(shift.norm())
+    return pose_difference(expected, poses.camera1_from[name], scene.objects[name].reference_point)
 
 
 def _out_of_joint(scene: Scene, name: str, displacement: tuple[float, float] | None, limits: Limits) -> str | None:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from femoreg_torch.geometry import rotation_angle
+from femoreg_torch.geometry import pose_difference
 from femoreg_torch.optimize import Result
-from femoreg_torch.registration.scene import Body, Poses, Scene, reference_point_in_view
+from femoreg_torch.registration.scene import Body, Poses, Scene
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,5 @@ def restarts_of(
 def _apart(scene: Scene, body: Body, first: Poses, second: Poses) -> tuple[float, float]:
     """Degrees and mm between two poses of what a body moves, in the camera that it moves in."""
     name = next(iter(body.objects or first.camera1_from))
-    turned = first.camera_from(name)[body.view, :3, :3].mT @ second.camera_from(name)[body.view, :3, :3]
-    points = [reference_point_in_view(scene, poses, name, body.view) for poses in (first, second)]
-    return float(torch.rad2deg(rotation_angle(turned))), float((points[0] - points[1]).norm())
+    before, after = (poses.camera_from(name)[body.view] for poses in (first, second))
+    return pose_difference(before, after, scene.objects[name].reference_point)

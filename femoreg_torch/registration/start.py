@@ -90,12 +90,12 @@ def find_start(
 
 
 def _check_rotation(pnp: PnpResult) -> None:
-    open_deg = float(torch.rad2deg(pnp.covariance[:3, :3].trace().sqrt()))
-    if open_deg > MOST_ROTATION_DEG:
+    if pnp.rotation_deviation_deg > MOST_ROTATION_DEG:
         raise InputError(
             f"too few usable landmarks: {int(pnp.inliers.sum())} of {len(pnp.inliers)} agree, but they fix the "
-            f"rotation only to {open_deg:.0f}°, and no outlines help, as the CT's labels do not tell the hip bones "
-            "apart. Take a view that shows more of the pelvis, or label the hip bones 1 (left) and 2 (right)."
+            f"rotation only to {pnp.rotation_deviation_deg:.0f}°, and no outlines help, as the CT's labels do not tell "
+            "the hip bones apart. Take a view that shows more of the pelvis, or label the hip bones 1 (left) and 2 "
+            "(right)."
         )
 
 
