@@ -57,11 +57,11 @@ def simulate(
     console.print(f"Simulated case {seed} written to {out} (look at {out / 'preview.png'})")
 
 
-def dataset(config: str = "deepfluoro", *, out: Path) -> None:
+def dataset(config: str, *, out: Path) -> None:
     """Render labelled fluoroscopy into an HDF5 file in the layout of the public DeepFluoro data set.
 
     Args:
-        config: Preset of `configs/simulation` with patients, views and X-ray settings, or a YAML file.
+        config: Preset of `configs/simulation` with patients, views and X-ray settings (deepfluoro), or a YAML file.
         out: File to write, `.h5`; about half a second and 0.1 MB for an image of 180 × 180 pixels.
     """
     from rich.console import Console

@@ -195,3 +195,11 @@ def test_the_installed_overview_is_quick_and_complete() -> None:
         assert len(line.split()) > 3
         assert "not installed" not in line
     assert done.stderr == ""
+
+
+def test_a_data_set_is_asked_for_by_the_name_of_its_preset(tmp_path: Path) -> None:
+    command = [FEMOREG, "dataset", "nothing", "--out", str(tmp_path / "views.h5")]
+    done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
+    assert done.returncode == 2
+    assert "'nothing'" in done.stderr
+    assert not list(tmp_path.iterdir())
