@@ -2,6 +2,7 @@
 
 from femoreg_torch.geometry.camera import Camera, centred_camera, project_points
 from femoreg_torch.geometry.carm import CArm, carm_from_dict, load_carm, orbit_angles
+from femoreg_torch.geometry.poses import Poses, first_view_only, poses_by_object
 from femoreg_torch.geometry.rigid import (
     about_point,
     check_rigid,
@@ -20,6 +21,7 @@ from femoreg_torch.geometry.rigid import (
 __all__ = [
     "CArm",
     "Camera",
+    "Poses",
     "about_point",
     "carm_from_dict",
     "centred_camera",
@@ -27,12 +29,14 @@ __all__ = [
     "euler_xyz_deg",
     "exp_se3",
     "exp_so3",
+    "first_view_only",
     "invert_rigid",
     "load_carm",
     "log_se3",
     "log_so3",
     "orbit_angles",
     "pose_difference",
+    "poses_by_object",
     "project_points",
     "rigid",
     "rotation_angle",

@@ -4,6 +4,7 @@ Camera frame: origin at the X-ray source, +x along detector columns, +y along ro
 OpenCV), mm. The centre of the first pixel is at (column, row) = (0, 0).
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -24,6 +25,11 @@ class Camera:
     def __post_init__(self) -> None:
         if not self.sdd_mm > 0 or not min(self.pixel_mm) > 0 or min(self.shape) < 1:
             raise InputError(f"camera: source distance, pixel size and shape must be positive, got {self}.")
+
+    @property
+    def mean_pixel_mm(self) -> float:
+        """Edge of a square pixel with the same area, on the detector."""
+        return math.sqrt(self.pixel_mm[0] * self.pixel_mm[1])
 
     def downsampled(self, factor: int) -> "Camera":
         """The camera of an image averaged over `factor` × `factor` blocks: c' = (c + 0.5) / factor − 0.5.

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -68,9 +69,12 @@ def _numbers(value: Any, count: int, where: str) -> list[float]:
     return [float(v) for v in values]
 
 
-def load_carm(name: str) -> CArm:
-    """The C-arm preset `configs/carm/<name>.yaml`. Raises `InputError` with the list of presets if there is none."""
-    return carm_from_dict(load_preset("carm", name), f"C-arm preset {name}")
+def load_carm(name: str | Path) -> CArm:
+    """The C-arm preset `configs/carm/<name>.yaml`, or the C-arm in a YAML file with the keys of `carm_from_dict`.
+
+    Raises `InputError` with the list of presets if there is none of this name, and for a file that is not of that kind.
+    """
+    return carm_from_dict(load_preset("carm", name), f"C-arm {name}")
 
 
 def orbit_angles(half_range_deg: float, step_deg: float) -> Tensor:

@@ -1,7 +1,7 @@
 """Rigid transforms as 4×4 matrices, batched, differentiable everywhere that matters (identity and near π included).
 
-A transform is named after what it does, `camera_from_pelvis @ points_pelvis`; a twist is (rotation vector in radians,
-translation in mm), in this order, as a tensor (..., 6).
+A transform is named after what it does: `camera_from_object` takes points of the object to the camera frame. A twist is
+(rotation vector in radians, translation in mm), in this order, as a tensor (..., 6).
 """
 
 import math

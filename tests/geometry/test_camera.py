@@ -35,13 +35,13 @@ def test_projection_agrees_with_opencv():
         points.numpy(), twist[:3].numpy(), camera_from_points[:3, 3].numpy(), CAMERA.matrix().numpy(), np.zeros(5)
     )
     pixels = project_points(CAMERA, transform_points(camera_from_points, points))
-    assert_close(pixels, torch.from_numpy(truth).reshape(-1, 2), atol=1e-9, rtol=0)
+    assert_close(pixels, torch.from_numpy(truth).reshape(-1, 2), atol=1e-11, rtol=0)
 
 
 def test_pixel_positions_project_onto_their_own_pixels():
     pixels = project_points(CAMERA, CAMERA.pixel_positions() * 0.37)
     rows, columns = torch.meshgrid(torch.arange(120.0), torch.arange(161.0), indexing="ij")
-    assert_close(pixels, torch.stack([columns, rows], -1).double(), atol=1e-10, rtol=0)
+    assert_close(pixels, torch.stack([columns, rows], -1).double(), atol=1e-12, rtol=0)
 
 
 def test_points_at_or_behind_the_source_are_nan_and_leave_gradients_finite():
@@ -66,13 +66,13 @@ def test_a_coarser_pixel_lies_in_the_middle_of_those_it_averages(factor):
     rows, columns = coarse.shape
     fine = CAMERA.pixel_positions()[: rows * factor, : columns * factor]
     blocks = fine.reshape(rows, factor, columns, factor, 3).mean((1, 3))
-    assert_close(coarse.pixel_positions(), blocks, atol=1e-10, rtol=0)
+    assert_close(coarse.pixel_positions(), blocks, atol=1e-12, rtol=0)
     assert (rows, columns) == (120 // factor, 161 // factor)
 
 
 def test_two_steps_of_downsampling_are_one():
     twice = CAMERA.downsampled(2).downsampled(2)
-    assert_close(twice.pixel_positions(), CAMERA.downsampled(4).pixel_positions(), atol=1e-10, rtol=0)
+    assert_close(twice.pixel_positions(), CAMERA.downsampled(4).pixel_positions(), atol=1e-12, rtol=0)
 
 
 def test_a_centred_camera_stays_centred():

@@ -1,0 +1,48 @@
+"""Label tables: which ids of a label map belong to which bone."""
+
+from pathlib import Path
+
+from femoreg_torch.anatomy.body import Anatomy
+from femoreg_torch.configs import load_preset, preset_names
+from femoreg_torch.errors import InputError
+
+_GROUP = "anatomy/labels"
+LARGEST_ID = 65535
+
+LabelTable = dict[str, tuple[int, ...]]  # ids of bones (or of groups of bones) by name
+
+
+def label_table_names() -> list[str]:
+    """Names of the tables in `configs/anatomy/labels/`."""
+    return preset_names(_GROUP)
+
+
+def label_table(name: str | Path) -> LabelTable:
+    """Ids of each bone in the label maps of a known source, by the table's name or YAML file.
+
+    Raises `InputError` with the known names if there is no such table, and for ids that are not whole numbers above 0.
+    """
+    where = f"label table {name}"
+    content = load_preset(_GROUP, name)
+    if set(content) != {"anatomy", "bones"} or not isinstance(content["bones"], dict):
+        raise InputError(
+            f"{where}: the keys `anatomy` and `bones` were expected, found {', '.join(map(str, content))}."
+        )
+    return {str(bone): label_ids(ids, f"{where}, bones.{bone}") for bone, ids in content["bones"].items()}
+
+
+def label_ids(value: object, where: str) -> tuple[int, ...]:
+    """One id, or a list of ids, as a tuple. Raises `InputError` that starts with `where`."""
+    ids = value if isinstance(value, list) else [value]
+    if not ids or not all(type(n) is int and 0 < n <= LARGEST_ID for n in ids):
+        raise InputError(f"{where}: a label id above 0, or a list of them, was expected, found {str(value)[:60]}.")
+    return tuple(ids)
+
+
+def bone_of_name(anatomy: Anatomy, text: str) -> str | None:
+    """The bone that another program calls by this name (a segment of 3D Slicer, a file), or None."""
+    wanted = " ".join(text.replace("_", " ").replace("-", " ").lower().split())
+    for bone in anatomy.bones:
+        if wanted in (bone.name.replace("_", " "), *bone.names):
+            return bone.name
+    return None

@@ -1,0 +1,69 @@
+"""Classes that a preset names by `kind`: those built in, and those that other packages register by entry point.
+
+A package adds a similarity, say, by these lines of its `pyproject.toml`; presets then say `kind: mine`:
+
+    [project.entry-points."femoreg_torch.similarities"]
+    mine = "my_package:MySimilarity"
+
+The class is a frozen dataclass of settings; the other keys beside `kind` are its fields.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Any, Literal
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.settings import read_record
+
+Group = Literal[
+    "femoreg_torch.similarities",
+    "femoreg_torch.optimisers",
+    "femoreg_torch.steps",
+    "femoreg_torch.networks",
+    "femoreg_torch.losses",
+]
+
+
+def find(group: Group, kind: str, builtin: Mapping[str, Any], where: str) -> Any:
+    """The class of a kind: one of `builtin` (by kind), or one that an entry point of the group names.
+
+    Raises `InputError` that starts with `where` for an unknown kind, with those known, and for one that cannot be
+    imported, with the reason.
+    """
+    if kind in builtin:
+        return builtin[kind]
+    others = {entry.name: entry for entry in entry_points(group=group)}
+    if kind not in others:
+        known = ", ".join([*builtin, *sorted(others.keys() - builtin.keys())])
+        raise InputError(
+            f"{where}: unknown kind {str(kind)[:60]!r}. Known kinds: {known}. Others are added by the entry-point "
+            f"group {group}."
+        )
+    try:
+        return others[kind].load()
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"{where}: kind {kind!r}, {others[kind].value}, cannot be imported ({error}).") from error
+
+
+def pop_kind(content: Any, where: str) -> tuple[str, dict[str, Any]]:
+    """The `kind` of a mapping, and all its other keys. Raises `InputError` that starts with `where` if it has none."""
+    if not isinstance(content, dict) or not isinstance(content.get("kind"), str):
+        raise InputError(f"{where}: a mapping with the key `kind` was expected, found {str(content)[:60]}.")
+    return content["kind"], {key: value for key, value in content.items() if key != "kind"}
+
+
+def read_kind(group: Group, builtin: Mapping[str, Any], content: Any, where: str) -> Any:
+    """An object of the class that `kind` in a mapping names, its fields read from the other keys.
+
+    Raises `InputError` that starts with `where`, see `find` and `read_record`.
+    """
+    kind, rest = pop_kind(content, where)
+    return read_record(record_of(find(group, kind, builtin, where), where), rest, f"{where}, {kind}")
+
+
+def record_of(found: Any, where: str) -> Any:
+    """The same class. Raises `InputError` that starts with `where` if it is no dataclass."""
+    if not (isinstance(found, type) and dataclasses.is_dataclass(found)):
+        raise InputError(f"{where}: {found!r} was expected to be a dataclass of settings.")
+    return found
