@@ -2,7 +2,8 @@
 
     python benchmarks/drr.py [--case FOLDER] [--device cpu|cuda] [--seconds 5] [--peer-poses 4]
 
-The case folder needs ct.nii.gz and labels.nii.gz (1 left hip, 2 right hip, 4 sacrum); without one a phantom serves.
+The case folder needs ct.nii.gz and labels.nii.gz, with ids as in the label table `femoreg`; without one
+a phantom serves.
 Every row is measured in a process of its own. Writes benchmarks/RESULTS.md.
 """
 

@@ -6,13 +6,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from femoreg_torch.anatomy import HIP, label_table
 from femoreg_torch.geometry import about_point, exp_se3, load_carm
 from femoreg_torch.volume import read_ct, read_labels, structure_attenuation
 from femoreg_torch.volume.grid import Volume, axis_aligned
 
 CAMERA = load_carm("cios_fusion").camera.downsampled(4)  # 384 × 384 of 0.776 mm, 1020 mm from the source
 _DEPTH_MM = 800.0  # source to the middle of the pelvis
-_PELVIS = (1, 2, 4)  # hip bones and sacrum
 
 
 def default_case() -> Path | None:
@@ -26,8 +26,9 @@ def pelvis(case: Path | None) -> tuple[Volume, str]:
     """Attenuation of the pelvis of a case folder (or of a phantom without one), and what to call it."""
     if case is None:
         return phantom(), "phantom"
-    ct = read_ct(case / "ct.nii.gz")
-    return structure_attenuation(ct, read_labels(case / "labels.nii.gz", ct), _PELVIS), f"pelvis of `{case.name}`"
+    ct, ids = read_ct(case / "ct.nii.gz"), label_table("femoreg")
+    bones = [number for bone in HIP.members("pelvis") for number in ids[bone]]
+    return structure_attenuation(ct, read_labels(case / "labels.nii.gz", ct), bones), f"pelvis of `{case.name}`"
 
 
 def phantom() -> Volume:

@@ -16,7 +16,7 @@ from scene import CAMERA, default_case, pelvis, poses
 from torch import Tensor
 
 from femoreg_torch.drr import project
-from femoreg_torch.similarity import grad_ncc
+from femoreg_torch.similarity import GradNcc
 
 _RADIUS = 5  # patches of 11 × 11 pixels
 _SMOOTHING_PX = 1.1
@@ -24,7 +24,7 @@ _SMOOTHING_PX = 1.1
 
 def femoreg(fixed: Tensor) -> Callable[[Tensor], Tensor]:
     """This project: costs (B,) of images (B, H, W)."""
-    return grad_ncc(fixed, _RADIUS, _SMOOTHING_PX)
+    return GradNcc(_RADIUS, _SMOOTHING_PX).against(fixed)
 
 
 def nanodrr(fixed: Tensor) -> Callable[[Tensor], Tensor]:

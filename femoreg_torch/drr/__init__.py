@@ -1,4 +1,4 @@
-"""Digitally reconstructed radiographs: one public operator, back ends behind it."""
+"""Digitally reconstructed radiographs: line integrals of attenuation by one public operator, with several back ends."""
 
 from femoreg_torch.drr.operator import project, project_with_jacobian
 

@@ -1,4 +1,8 @@
-"""Where a volume is empty: a map of bricks that tells how far a packet of rays may leap."""
+"""Empty-space skipping: a distance map over bricks of voxels tells how far a packet of rays may leap.
+
+As Šrámek and Kaufman, Fast ray-tracing of rectilinear volume data using distance transforms, IEEE TVCG 6 (2000) 236, by
+the chessboard distance; here it is counted in bricks, and rays travel in packets.
+"""
 
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary

@@ -1,4 +1,4 @@
-"""The projector on the CPU: compiled by numba, all cores, leaping over empty space in packets of rays.
+"""The projector on the CPU: compiled by numba, on all cores, with empty-space skipping for packets of rays.
 
 All kernels walk the rays of one volume in the same way. A ray is `source + t · direction` in padded index space, t mm
 from the X-ray source; samples lie at whole multiples of the step, so that neither the batch nor the place of the volume

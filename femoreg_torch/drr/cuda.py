@@ -19,8 +19,8 @@ from femoreg_torch.drr.device_bricks import bricked_on_device, padded_shape
 from femoreg_torch.geometry.camera import Camera
 from femoreg_torch.volume.grid import Volume
 
-_TILE = 8  # rays along the edge of a tile
-_WARPS = 1  # per tile, so that its rays agree on a leap without a barrier
+TILE = 8  # rays along the edge of a tile
+WARPS = 1  # per tile, so that its rays agree on a leap without a barrier
 _MOST_VOXELS = 2**31  # the kernels count voxels in int32
 
 
@@ -54,26 +54,30 @@ def _too_large(volume: Volume) -> str | None:
     return f"the volume has {voxels} voxels with its rim, the kernels can count 2³¹" if voxels >= _MOST_VOXELS else None
 
 
-def project(volume: Volume, affines: Tensor, camera: Camera, step_mm: float) -> Tensor:
+def project(volume: Volume, affines: Tensor, camera: Camera, step_mm: float, tile: int = TILE) -> Tensor:
     """Line integrals (B, H, W) float32 of a volume for `affines` (B, 3, 4) float64, index from camera mm.
 
     Differentiable in `affines`, and in the volume's data, which may be float16 or bfloat16: sums are float32 all the
     same. The gradient by `affines` is the same in every run, that by the data to rounding only (it needs atomics). A
-    pose that is not finite gives an image of nan: to raise an error would mean to wait for the device.
+    pose that is not finite gives an image of nan: to raise an error would mean to wait for the device. `tile` is a
+    power of two: the rays along the edge of a tile, which leap together.
     """
-    image: Tensor = _Projection.apply(volume.data, affines, volume, camera, step_mm)
+    image: Tensor = _Projection.apply(volume.data, affines, volume, camera, step_mm, tile)
     return image
 
 
-def jacobian(volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, step_mm: float) -> tuple[Tensor, Tensor]:
+def jacobian(
+    volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, step_mm: float, tile: int = TILE
+) -> tuple[Tensor, Tensor]:
     """Line integrals (B, H, W) and their derivatives (B, H, W, n).
 
     `changes` (B, n, 3, 4) are the derivatives of `affines` (B, 3, 4) with respect to the n parameters, all float64.
+    `tile` is as for `project`.
     """
     image = volume.data.new_empty((len(affines), *camera.shape), dtype=torch.float32)
     derivatives = image.new_empty((*image.shape, changes.shape[1]))
     outputs = (changes.contiguous(), changes.shape[1], image, derivatives)
-    _launch(_kernels().jacobian, _contents(volume), volume, affines, camera, step_mm, outputs)
+    _launch(_kernels().jacobian, _contents(volume), volume, affines, camera, step_mm, tile, outputs)
     return image, derivatives
 
 
@@ -81,18 +85,20 @@ class _Projection(torch.autograd.Function):
     """The kernels as an autograd function of the volume's data and of index-from-camera affines (B, 3, 4)."""
 
     @staticmethod
-    def forward(ctx: Any, data: Tensor, affines: Tensor, volume: Volume, camera: Camera, step_mm: float) -> Tensor:
+    def forward(
+        ctx: Any, data: Tensor, affines: Tensor, volume: Volume, camera: Camera, step_mm: float, tile: int
+    ) -> Tensor:
         ctx.save_for_backward(affines)
-        ctx.volume, ctx.camera, ctx.step_mm = volume, camera, step_mm
+        ctx.volume, ctx.camera, ctx.step_mm, ctx.tile = volume, camera, step_mm, tile
         image = data.new_empty((len(affines), *camera.shape), dtype=torch.float32)
-        _launch(_kernels().forward, _contents(volume), volume, affines, camera, step_mm, (image,))
+        _launch(_kernels().forward, _contents(volume), volume, affines, camera, step_mm, tile, (image,))
         return image
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         (affines,) = ctx.saved_tensors
-        scene = (ctx.volume, affines, ctx.camera, ctx.step_mm)
+        scene = (ctx.volume, affines, ctx.camera, ctx.step_mm, ctx.tile)
         weights = upstream.to(torch.float32).contiguous()
         data_gradient = affine_gradient = None
         if ctx.needs_input_grad[0]:
@@ -101,10 +107,10 @@ class _Projection(torch.autograd.Function):
             _launch(_kernels().volume_gradient, (), *scene, (weights, padded))
             data_gradient = padded[tuple(slice(RIM, RIM + n) for n in shape)]
         if ctx.needs_input_grad[1]:
-            parts = affines.new_empty((len(affines), _tiles(ctx.camera), 3, 4))
+            parts = affines.new_empty((len(affines), _tiles(ctx.camera, ctx.tile), 3, 4))
             _launch(_kernels().pose_gradient, _contents(ctx.volume), *scene, (weights, parts))
             affine_gradient = parts.sum(1)
-        return data_gradient, affine_gradient, None, None, None
+        return data_gradient, affine_gradient, None, None, None, None
 
 
 @functools.cache
@@ -112,9 +118,9 @@ def _kernels() -> ModuleType:
     return importlib.import_module("femoreg_torch.drr.triton_kernels")
 
 
-def _tiles(camera: Camera) -> int:
+def _tiles(camera: Camera, tile: int) -> int:
     rows, columns = camera.shape
-    return -(-rows // _TILE) * -(-columns // _TILE)
+    return -(-rows // tile) * -(-columns // tile)
 
 
 def _contents(volume: Volume) -> tuple[Tensor, Tensor]:
@@ -129,6 +135,7 @@ def _launch(
     affines: Tensor,
     camera: Camera,
     step_mm: float,
+    tile: int,
     outputs: tuple[Tensor | int, ...],
 ) -> None:
     """Run a kernel, one program per tile and pose; all take these arguments in this order."""
@@ -136,14 +143,14 @@ def _launch(
     padded_affines = affines.detach().to(torch.float64, memory_format=torch.contiguous_format, copy=True)
     padded_affines[:, :, 3] += RIM
     with torch.cuda.device_of(volume.data):  # Triton launches on the current device
-        kernel[(_tiles(camera), len(affines))](
+        kernel[(_tiles(camera, tile), len(affines))](
             *contents,
             padded_affines,
             geometry.to(affines.device, non_blocking=True),
             *padded_shape(volume.data.shape),
             *camera.shape,
             *outputs,
-            tile=_TILE,
-            num_warps=_WARPS,
+            tile=tile,
+            num_warps=WARPS,
             enable_fp_fusion=True,
         )

@@ -20,7 +20,7 @@ from femoreg_torch.volume.grid import Volume
 
 
 def project(
-    volumes: Sequence[Volume],
+    volumes: Volume | Sequence[Volume],
     camera_from_volume: Tensor,
     camera: Camera,
     step_mm: float = 1.0,
@@ -29,7 +29,8 @@ def project(
 ) -> Tensor:
     """Line integrals of attenuation through one or several volumes, for a batch of poses.
 
-    `camera_from_volume` (B, V, 4, 4) maps the mm space of each of the V volumes (LPS or CAD) into the camera frame.
+    `camera_from_volume` maps the mm space of the volume (LPS or CAD) into the camera frame: (B, 4, 4) of one volume, or
+    (B, V, 4, 4) of a sequence of V volumes.
     Values are interpolated trilinearly, are zero outside, and are summed at whole multiples of `step_mm` along each ray
     from the source, times the step. Returns (B, H, W) float32, summed over volumes, or (B, V, H, W) if `separate`.
 
@@ -40,6 +41,12 @@ def project(
     `Camera.downsampled`). Raises `InputError` where shapes or devices do not fit, and for poses that are not finite;
     these give an image of nan on CUDA, where to look at them would mean to wait.
     """
+    if isinstance(volumes, Volume):
+        if camera_from_volume.shape[1:] != (4, 4):
+            raise InputError(
+                f"project: one volume needs poses of shape (B, 4, 4), got {tuple(camera_from_volume.shape)}."
+            )
+        volumes, camera_from_volume = [volumes], camera_from_volume[:, None]
     _check(volumes, camera_from_volume)
     images = [
         _project_one(volume, _index_from_camera(volume, camera_from_volume[:, v]), camera, step_mm)

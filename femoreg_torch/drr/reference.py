@@ -1,4 +1,4 @@
-"""The projector in plain torch: short, on any device, in any float dtype. The oracle of the tests."""
+"""The projector as plain ray marching in torch, on any device, in any float dtype: the reference of the tests."""
 
 import torch
 from torch import Tensor

@@ -14,7 +14,7 @@ from torch import Tensor
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera
-from femoreg_torch.volume.nifti import holds_non_finite
+from femoreg_torch.volume.itk import read_itk
 
 _ITK_SUFFIXES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
@@ -29,13 +29,7 @@ def _read_picture(path: Path) -> np.ndarray:
 
 
 def _read_itk(path: Path) -> np.ndarray:
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)  # the reason of a failure comes with the exception
-    try:
-        image = sitk.ReadImage(str(path))
-    except RuntimeError as error:
-        reason = str(error).strip().splitlines()[-1].removeprefix("sitk::ERROR: ")
-        raise InputError(f"{path}: cannot be read as NIfTI, MHA or NRRD ({reason}).") from error
-    array = sitk.GetArrayFromImage(image)
+    array = sitk.GetArrayFromImage(read_itk(path))
     return array[0] if array.ndim == 3 and array.shape[0] == 1 else array
 
 
@@ -82,7 +76,7 @@ def read_image(path: Path) -> Tensor:
         raise InputError(f"{path}: one image was expected, found {' × '.join(str(n) for n in array.shape)} values.")
     image = torch.from_numpy(array.astype(np.float32))
     lowest, highest = (v.item() for v in image.aminmax())
-    if not np.isfinite([lowest, highest]).all() or holds_non_finite(path):
+    if not np.isfinite([lowest, highest]).all():
         raise InputError(f"{path}: holds pixels that are not finite (NaN or infinite). Export the image anew.")
     if lowest == highest:
         raise InputError(f"{path}: every pixel is {lowest:g}, there is nothing to be seen. Choose another image.")

@@ -1,8 +1,9 @@
-"""Pose of an object from landmarks in one image, robust against wrong ones.
+"""Pose of an object from its landmarks in one image (perspective-n-point), robust against outliers.
 
 Hypotheses from small subsets (SQPnP: Terzakis and Lourakis, ECCV 2020), the one with the best consensus (MSAC: Torr and
-Zisserman, CVIU 78, 2000), then a Huber-weighted least-squares refinement of the reprojection error. Where standard
-deviations of the landmarks are known, it is over all of them, in units of these, with a weak prior on the view.
+Zisserman, CVIU 78, 2000), then a refinement that minimises the Huber loss of the reprojection residuals of the inliers.
+Where standard deviations of the landmarks are known, the pose is the maximum a posteriori over all landmarks, with a
+weak prior on the direction of the beam.
 """
 
 from dataclasses import dataclass
@@ -28,10 +29,11 @@ _FLOOR_MM = 1.0  # least standard deviation of a landmark that the covariance as
 _HYPOTHESES = 400
 _SUBSET_SIZES = (4, 5, 6)
 _DEPTHS = (0.2, 1.0)  # of the source-to-detector distance: the object lies between source and detector
-_MIDDLE_DEPTHS = (0.45, 0.95)  # the same for the middle of the points: nobody lies on the tube or touches the detector
+_MIDDLE_DEPTHS = (0.45, 0.95)  # the same for the points' centroid: no patient lies on the tube or on the detector
 _HUBER_DEVIATIONS = 1.5
 _ROTATION_DEG = 10.0  # greatest standard deviation, over all axes, of a pose that is given
 _STEPS = (0.01, 0.01, 0.01, 1, 1, 10)  # typical sizes of a twist, rad and mm
+_ADVICE = "Take a view that shows more of the object, or give landmarks placed by hand."
 _TILT_DEG = 30.0  # prior standard deviation of the beam about the patient's front-to-back axis, each way
 
 
@@ -41,7 +43,7 @@ class PnpResult:
 
     camera_from_object: Tensor  # (4, 4) float64
     inliers: Tensor  # (N,) bool: within 10 mm on the detector
-    rms_px: float  # distance of the inliers from their landmarks
+    rms_px: float  # root mean square reprojection residual of the inliers
     covariance: Tensor  # (6, 6) of (rotation in rad, translation in mm), camera axes, about the used points' centroid
 
     @property
@@ -62,11 +64,11 @@ def solve_pnp(
 
     `weights` (N,) are positive, for instance the confidences. `deviations_px` (N,) are standard deviations of the
     landmarks along each axis in the image, `point_deviations_mm` (N,) those of the points themselves (0 if not given),
-    which the image shows magnified; with the former the pose is the most probable one given that the beam runs from
-    front to back within about 30°, and the covariance is that of this posterior. Only poses are considered that have
-    the points between source and detector and the beam entering from the patient's front, which is the case wherever
-    the image is shown with patient left on the right and head up (or turned by 180°). The result does not depend on
-    chance.
+    which the image shows magnified; with the former the pose is the maximum a posteriori, with the prior that the beam
+    runs from front to back within about 30°, and the covariance is that of the posterior. Only poses are considered
+    that have the points between source and detector and the beam entering from the patient's front, which is the case
+    wherever the image is shown with patient left on the right and head up (or turned by 180°). The result does not
+    depend on chance.
 
     Raises `InputError` "too few usable landmarks …" when fewer than four, or fewer than half of the points, agree, or
     if by `deviations_px` the rotation is uncertain by more than 10°.
@@ -92,15 +94,14 @@ def solve_pnp(
     if pose is None or not _enough(inliers) or not _plausible(pose.numpy(), object_points, camera):
         raise InputError(
             f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree on a pose, but at least {MINIMUM} "
-            "and half of them must. Take a view that shows more of the pelvis, or give the landmarks by hand."
+            f"and half of them must. {_ADVICE}"
         )
     distances = _distances(pose, points, pixels, camera)[inliers]
     result = PnpResult(pose, torch.from_numpy(inliers), float(np.sqrt((distances**2).mean())), covariance)
     if deviations_px is not None and result.rotation_deviation_deg > _ROTATION_DEG:
         raise InputError(
             f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree, but they fix the rotation only to "
-            f"{result.rotation_deviation_deg:.0f}°. Take a view that shows more of the pelvis, or give the landmarks "
-            "by hand."
+            f"{result.rotation_deviation_deg:.0f}°. {_ADVICE}"
         )
     return result
 
@@ -129,10 +130,7 @@ def _check(points: Tensor, pixels: Tensor, weights: Tensor, deviations_px: Tenso
     if deviations_px is not None and (deviations_px.shape != (count,) or not (deviations_px > 0).all()):
         raise InputError(f"solve_pnp: deviations_px must be ({count},) and positive.")
     if count < MINIMUM:
-        raise InputError(
-            f"too few usable landmarks: {count} given, at least {MINIMUM} are needed. "
-            "Take a view that shows more of the pelvis, or give the landmarks by hand."
-        )
+        raise InputError(f"too few usable landmarks: {count} given, at least {MINIMUM} are needed. {_ADVICE}")
 
 
 def _enough(inliers: NDArray[np.bool_]) -> bool:
@@ -149,7 +147,7 @@ def _subsets(count: int) -> list[tuple[int, ...]]:
 
 
 def _plausible(camera_from_object: Array, points: Array, camera: Camera) -> bool:
-    """Whether all points lie between source and detector and the beam runs from the patient's front to the back."""
+    """Whether all points lie between source and detector and the beam enters from the patient's front (+y is back)."""
     depth = points @ camera_from_object[2, :3] + camera_from_object[2, 3]
     low, high = (share * camera.sdd_mm for share in _DEPTHS)
     nearest, furthest = (share * camera.sdd_mm for share in _MIDDLE_DEPTHS)
@@ -158,7 +156,7 @@ def _plausible(camera_from_object: Array, points: Array, camera: Camera) -> bool
 
 
 def _consensus(points: Array, pixels: Array, weights: Array, camera: Camera, limit_px: float) -> Tensor | None:
-    """The hypothesis of least truncated squared error, or None if no subset has a plausible pose."""
+    """The hypothesis of least truncated squared residuals (MSAC), or None if no subset has a plausible pose."""
     matrix = camera.matrix().numpy()
     best, best_cost = None, np.inf
     for subset in _subsets(len(points)):
@@ -185,17 +183,17 @@ def _consensus(points: Array, pixels: Array, weights: Array, camera: Camera, lim
 
 
 def _distances(camera_from_object: Tensor, points: Tensor, pixels: Tensor, camera: Camera) -> Array:
-    """Distance (N,) in pixels between projected points and `pixels`; infinite behind the source."""
+    """Reprojection residuals (N,): pixels between projected points and `pixels`; infinite behind the source."""
     projected = project_points(camera, transform_points(camera_from_object, points.to(torch.float64)))
     return (projected - pixels).norm(dim=1).nan_to_num(torch.inf).numpy()
 
 
 @dataclass(frozen=True)
 class _Movable:
-    """Points about a pose that is turned about their middle and shifted by a twist (rotation vector, translation)."""
+    """Points about a pose that is turned about their centroid and shifted by a twist (rotation vector, translation)."""
 
-    arms: Array  # (N, 3) from the middle, camera axes
-    centre: Array  # (3,) the middle in the camera frame
+    arms: Array  # (N, 3) from the centroid, camera axes
+    centre: Array  # (3,) the centroid in the camera frame
     matrix: Array  # (3, 3) of the camera
 
     def pixels(self, twist: Array) -> Array:
@@ -241,7 +239,7 @@ def _refine(
 def _most_probable(
     camera_from_object: Tensor, points: Array, pixels: Array, deviations_px: Array, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """The pose of greatest posterior near `camera_from_object`, and its covariance (6, 6) about the points' middle.
+    """The maximum a posteriori pose near `camera_from_object`, and its covariance (6, 6) about the points' centroid.
 
     Residuals are in standard deviations; beyond 1.5 of them they count by Huber's rule. The beam's direction in the
     patient is the third row of the rotation; its parts across the front-to-back axis are the prior's residuals.

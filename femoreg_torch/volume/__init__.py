@@ -1,27 +1,21 @@
-"""Volumes of the CT and of the device, their attenuation, and the landmarks of the hip."""
+"""Volumes of a CT and of devices, their attenuation, bones in label maps, and files of landmarks."""
 
 from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
+from femoreg_torch.volume.bones import BoneLabels, bone_labels
 from femoreg_torch.volume.device import labelled_device, scanned_device
 from femoreg_torch.volume.grid import Volume, axis_aligned
 from femoreg_torch.volume.labels import label_box_centre
-from femoreg_torch.volume.landmarks import (
-    HIP_LANDMARKS,
-    LANDMARK_SPREAD_MM,
-    LANDMARK_STEMS,
-    check_inside,
-    read_landmarks,
-    write_landmarks,
-)
+from femoreg_torch.volume.landmarks import check_inside, read_landmarks, write_landmarks
 from femoreg_torch.volume.mesh import check_closed, read_mesh, voxelise_mesh
-from femoreg_torch.volume.reading import read_ct, read_labels, read_volume, write_volume
+from femoreg_torch.volume.reading import read_ct, read_label_map, read_labels, read_volume, write_volume
 from femoreg_torch.volume.resample import crop, resample_isotropic
+from femoreg_torch.volume.segments import segment_names
 
 __all__ = [
-    "HIP_LANDMARKS",
-    "LANDMARK_SPREAD_MM",
-    "LANDMARK_STEMS",
+    "BoneLabels",
     "Volume",
     "axis_aligned",
+    "bone_labels",
     "check_closed",
     "check_inside",
     "crop",
@@ -29,12 +23,14 @@ __all__ = [
     "label_box_centre",
     "labelled_device",
     "read_ct",
+    "read_label_map",
     "read_labels",
     "read_landmarks",
     "read_mesh",
     "read_volume",
     "resample_isotropic",
     "scanned_device",
+    "segment_names",
     "structure_attenuation",
     "voxelise_mesh",
     "write_landmarks",

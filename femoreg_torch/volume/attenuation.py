@@ -1,4 +1,4 @@
-"""From Hounsfield units to linear attenuation, and the structures that a registration renders."""
+"""Linear attenuation from Hounsfield units, and that of single bones as a registration renders them."""
 
 from collections.abc import Sequence
 

@@ -15,7 +15,7 @@ from femoreg_torch.volume.reading import read_volume
 from femoreg_torch.volume.resample import crop, resample_isotropic
 
 _AIR_HU = -1000.0
-_EDGE_SIGMA = 0.35  # voxels; rounds the stairs of a label's edge, keeps its volume
+_EDGE_SIGMA = 0.35  # voxels; softens the staircase at a label's edge, keeps its volume
 _MARGIN = 3  # empty voxels around a device: the reach of the Gaussian (truncated at four deviations), and one more
 _EMPTY_HU = -500.0  # half-way between air and water: below it a voxel counts as empty
 
@@ -23,7 +23,7 @@ _EMPTY_HU = -500.0  # half-way between air and water: below it a voxel counts as
 def labelled_device(path: Path, ids: Sequence[int], hu: float, spacing_mm: float) -> Volume:
     """Attenuation (1/mm) of a solid of `hu` in the voxels with these label `ids`, cropped, HU counted from air.
 
-    The edge is softened over a voxel, as a voxelised mesh has shares of voxels there; voxels finer than `spacing_mm`
+    The edge is softened over a voxel, where a voxelised mesh has partial volumes; voxels finer than `spacing_mm`
     are averaged to it. Raises `InputError` for labels that are not whole numbers, or if one of the ids does not occur.
     """
     volume = read_volume(path)

@@ -1,24 +1,17 @@
-"""The 14 hip landmarks and the files that hold them. Inside, landmarks are LPS mm, always in the same order."""
+"""Files of landmarks, in 3-D. Inside, landmarks are LPS mm, in the order of their anatomy."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json, write_json
 from femoreg_torch.volume.grid import Volume
-
-LANDMARK_STEMS = ("FH", "GSN", "IOF", "MOF", "SPS", "IPS", "ASIS")
-HIP_LANDMARKS = tuple(f"{stem}-{side}" for stem in LANDMARK_STEMS for side in "lr")
-# Standard deviation along each axis, mm, with which a rule or a reader places a landmark on one bone: the spread of the
-# rules of `sim.patient.landmarks` over smoothings and bends of the surface (142 deformed training anatomies); five
-# raters of the ASIS differ by 0.4 to 4.5 mm. For a femoral head a guess.
-_SPREAD_MM = {"FH": 0.3, "GSN": 1.4, "IOF": 2.4, "MOF": 2.0, "SPS": 1.0, "IPS": 1.1, "ASIS": 1.8}
-LANDMARK_SPREAD_MM = tuple(_SPREAD_MM[name.split("-")[0]] for name in HIP_LANDMARKS)
 
 _LPS_FROM = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
 _FCSV_SPACES = {"0": "RAS", "1": "LPS", "RAS": "RAS", "LPS": "LPS"}  # numbers as in 3D Slicer before 4.11
@@ -84,12 +77,12 @@ def _point(value: Any, where: str) -> Tensor:
     return point
 
 
-def read_landmarks(path: Path) -> dict[str, Tensor]:
-    """Landmarks (3,) float64, LPS mm, in the order of `HIP_LANDMARKS`; a file may hold fewer than 14.
+def read_landmarks(path: Path, known: Sequence[str] | None = HIP.landmark_names) -> dict[str, Tensor]:
+    """Landmarks (3,) float64, LPS mm, in the order of the `known` names; a file may hold fewer.
 
-    Formats: `{"space": "LPS", "unit": "mm", "landmarks": {name: [x, y, z]}}`, 3D Slicer markups (`.mrk.json`) and
-    `.fcsv`, each in LPS or RAS as its header says. Raises `InputError` for an unknown or repeated name, another unit or
-    space, or a point that is not three finite numbers.
+    Without known names any will do, in the order of the file. Formats: `{"space": "LPS", "unit": "mm", "landmarks":
+    {name: [x, y, z]}}`, 3D Slicer markups (`.mrk.json`) and `.fcsv`, each in LPS or RAS as its header says. Raises
+    `InputError` for an unknown or repeated name, another unit or space, or a point that is not three finite numbers.
     """
     path = Path(path)
     if not path.is_file():
@@ -100,16 +93,17 @@ def read_landmarks(path: Path) -> dict[str, Tensor]:
         content = read_json(path)
         space, points = (_slicer_points if "markups" in content else _plain_points)(content, path)
     signs = torch.tensor(_signs(space, f"{path}, coordinate system"), dtype=torch.float64)
+    told = "" if known is None else f" Known names: {', '.join(known)}."
     found: dict[str, Tensor] = {}
     for name, value in points:
-        if name not in HIP_LANDMARKS:
-            raise InputError(f"{path}: unknown landmark {name!r}. Known names: {', '.join(HIP_LANDMARKS)}.")
+        if not isinstance(name, str) or not name or (known is not None and name not in known):
+            raise InputError(f"{path}: unknown landmark {str(name)[:60]!r}.{told}")
         if name in found:
             raise InputError(f"{path}: landmark {name} stands there twice. Keep one.")
         found[name] = _point(value, f"{path}, {name}") * signs
     if not found:
-        raise InputError(f"{path}: holds no landmark. Known names: {', '.join(HIP_LANDMARKS)}.")
-    return {name: found[name] for name in HIP_LANDMARKS if name in found}
+        raise InputError(f"{path}: holds no landmark.{told}")
+    return {name: found[name] for name in (known or found) if name in found}
 
 
 def write_landmarks(path: Path, landmarks: Mapping[str, Tensor]) -> None:

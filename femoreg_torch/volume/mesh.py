@@ -1,4 +1,8 @@
-"""Devices: closed CAD meshes in mm, and their voxels."""
+"""Devices: closed CAD meshes in mm, and their voxels.
+
+Formats, closedness and orientation are trimesh's. Its voxels, however, are either inside or outside; a projector needs
+the fraction of each that is inside, or thin walls come out by up to half a voxel too thick or thin.
+"""
 
 from pathlib import Path
 
@@ -90,8 +94,9 @@ def _accumulate(triangles: np.ndarray, coverage: np.ndarray) -> None:  # pragma:
 def voxelise_mesh(mesh: trimesh.Trimesh, spacing_mm: float, hu: float) -> Volume:
     """Attenuation (1/mm) of a solid of `hu` within a closed mesh, on cubic voxels along the mesh's own axes.
 
-    Each voxel holds the share of it that lies inside (exact along z, 4 × 4 sub-samples across), so edges are
-    anti-aliased and the volume is kept. `lps_from_index` maps indices to the mesh's CAD mm. HU count from air (−1000).
+    Each voxel is weighted by the fraction of it that lies inside (exact along z, 4 × 4 sub-samples across), so that
+    edges are anti-aliased and the volume is kept. `lps_from_index` maps indices to the mesh's CAD mm. HU count from air
+    (−1000).
     Raises `InputError` for an open mesh.
     """
     mesh = check_closed(mesh, "device")

@@ -1,26 +1,47 @@
-"""What the NIfTI reader of ITK hides: it turns values that are not finite into zero, which as HU would be water."""
+"""What SimpleITK's reader of NIfTI passes over: values that are not finite, files that are cut off or not compressed.
 
-import gzip
+It turns the first into zero, which as HU would be water, and fills the second up with zeros.
+"""
+
+import zlib
 from pathlib import Path
+from typing import Any
 
+import nibabel
 import numpy as np
 
-_HEADER_BYTES = 348
-_FLOATS = {16: "f4", 64: "f8"}  # NIfTI-1 datatype codes (nifti1.h)
+from femoreg_torch.errors import InputError
+
+_SUFFIXES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz")
 
 
-def holds_non_finite(path: Path) -> bool:
-    """True if `path` is a NIfTI-1 file of floating-point values of which some are NaN or infinite."""
-    if not path.name.lower().endswith((".nii", ".nii.gz")):
-        return False
-    opener = gzip.open if path.name.lower().endswith(".gz") else open
-    with opener(path, "rb") as file:
-        header = file.read(_HEADER_BYTES)
-        order = "<" if header[:4] == _HEADER_BYTES.to_bytes(4, "little") else ">"
-        kind = _FLOATS.get(int(np.frombuffer(header, order + "i2", 1, offset=70)[0]))
-        if kind is None:
-            return False
-        file.seek(int(np.frombuffer(header, order + "f4", 1, offset=108)[0]))
-        content = file.read()
-    values = np.frombuffer(content, order + kind, len(content) // int(kind[1]))
-    return not np.isfinite(values).all()
+def check_nifti(path: Path) -> None:
+    """Raises `InputError` for a NIfTI file (by its name) that is damaged or holds values that are not finite.
+
+    NIfTI-1 and NIfTI-2, in one file or two. Files of other names are passed.
+    """
+    if not path.name.lower().endswith(_SUFFIXES):
+        return
+    try:
+        image: Any = nibabel.load(path)  # its declared type is that of all formats, without voxels
+        integers = image.get_data_dtype().kind not in "fc"
+        # Integers are all finite. To decompress them only to see that none is missing would double the time to read.
+        if integers and path.suffix.lower() == ".gz" and _whole(path, image.dataobj):
+            return
+        values = np.asanyarray(image.dataobj.get_unscaled())
+    except (nibabel.filebasedimages.ImageFileError, OSError, EOFError, ValueError, zlib.error) as error:
+        reason = " ".join(str(error).replace(str(path), "it").split()).rstrip(".")
+        raise InputError(f"{path}: cannot be read as NIfTI ({reason}). Export or download it anew.") from error
+    if values.dtype.kind in "fc" and not np.isfinite(values).all():
+        raise InputError(f"{path}: holds values that are not finite (NaN or infinite). Repair or export it anew.")
+
+
+def _whole(path: Path, data: nibabel.arrayproxy.ArrayProxy) -> bool:
+    """Whether the last four bytes of a gzip file, its uncompressed size modulo 2³² (RFC 1952), are as `data` demands.
+
+    False does not mean that the file is damaged: one of several gzip members tells the size of the last.
+    """
+    expected = data.offset + int(np.prod(data.shape)) * data.dtype.itemsize
+    with path.open("rb") as file:
+        file.seek(-4, 2)
+        return int.from_bytes(file.read(), "little") == expected % 2**32

@@ -1,4 +1,4 @@
-"""Reading and writing of volumes. Whatever a file's index order, volumes inside run along +L, +P, +S."""
+"""Reading and writing of volumes. Whatever the index order of a file, index axes inside run along +L, +P, +S."""
 
 from pathlib import Path
 
@@ -7,41 +7,18 @@ import SimpleITK as sitk
 import torch
 from torch import Tensor
 
+from femoreg_torch.anatomy.tables import LARGEST_ID
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.volume.grid import Volume
-from femoreg_torch.volume.nifti import holds_non_finite
+from femoreg_torch.volume.itk import read_itk
 
 _FAT_HU, _BONE_HU = -50, 200  # every CT of a hip holds something below the first and something above the second
 
 
-def _read_dicom_series(folder: Path) -> sitk.Image:
-    reader = sitk.ImageSeriesReader()
-    series = {uid: reader.GetGDCMSeriesFileNames(str(folder), uid) for uid in reader.GetGDCMSeriesIDs(str(folder))}
-    if not series:
-        raise InputError(
-            f"{folder}: holds no DICOM series. Give the folder of the slices, or a NIfTI, NRRD or MHA file."
-        )
-    if len(series) > 1:
-        sizes = ", ".join(f"{len(names)} slices" for names in series.values())
-        raise InputError(
-            f"{folder}: holds {len(series)} DICOM series ({sizes}), one was expected. Move one to its own folder."
-        )
-    reader.SetFileNames(next(iter(series.values())))
-    return reader.Execute()
-
-
 def _read(path: Path) -> sitk.Image:
-    """The image with its index axes turned to run closest to +L, +P, +S. Raises `InputError`."""
-    path = Path(path)
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder.")
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)  # the reason of a failure comes with the exception
-    try:
-        image = _read_dicom_series(path) if path.is_dir() else sitk.ReadImage(str(path))
-    except RuntimeError as error:
-        reason = str(error).strip().splitlines()[-1].removeprefix("sitk::ERROR: ")
-        raise InputError(f"{path}: cannot be read as NIfTI, NRRD, MHA or DICOM series ({reason}).") from error
+    """The volume with its index axes turned to run closest to +L, +P, +S. Raises `InputError`."""
+    image = read_itk(path)
     if image.GetDimension() == 4 and image.GetSize()[3] == 1:
         image = image[:, :, :, 0]
     if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1 or min(image.GetSize()) < 2:
@@ -71,9 +48,9 @@ def read_volume(path: Path) -> Volume:
     `path` is a NIfTI, NRRD or MHA file or the folder of one DICOM series. Raises `InputError` for what cannot be read,
     is not 3-D, is mirrored, or holds values that are not finite.
     """
-    image = _read(path)
+    image = _read(Path(path))
     data = torch.from_numpy(sitk.GetArrayViewFromImage(image).astype(np.float32))
-    if not torch.isfinite(data).all() or holds_non_finite(Path(path)):
+    if not torch.isfinite(data).all():
         raise InputError(f"{path}: holds values that are not finite (NaN or infinite). Repair or export it anew.")
     return Volume(data, _lps_from_index(image))
 
@@ -92,27 +69,41 @@ def read_ct(path: Path) -> Volume:
     return volume
 
 
-def read_labels(path: Path, like: Volume) -> Volume:
-    """A label map (uint8) that lies on the grid of `like`. Raises `InputError` if it does not, or is no label map."""
-    image = _read(path)
+def read_label_map(path: Path) -> Volume:
+    """A label map by itself, on its own grid, oriented as by `read_volume`.
+
+    Labels are uint8 where they fit, else int32. Raises `InputError` for what `read_volume` refuses, and for values that
+    are no whole numbers from 0 to 65535.
+    """
+    image = _read(Path(path))
     data = sitk.GetArrayViewFromImage(image)
-    affine = _lps_from_index(image)
-    if data.shape != tuple(like.data.shape):
-        found, expected = (" × ".join(str(n) for n in reversed(shape)) for shape in (data.shape, like.data.shape))
+    if not (data.min() >= 0 and data.max() <= LARGEST_ID and (data == np.floor(data)).all()):
+        raise InputError(
+            f"{path}: a label map of whole numbers from 0 to {LARGEST_ID} was expected, found {data.min():g} to "
+            f"{data.max():g}. Export the segmentation as a label map."
+        )
+    labels = data.astype(np.uint8 if data.max() <= 255 else np.int32)
+    return Volume(torch.from_numpy(labels), _lps_from_index(image))
+
+
+def read_labels(path: Path, like: Volume) -> Volume:
+    """A label map (`read_label_map`) that lies on the grid of `like`. Raises `InputError` also if it does not."""
+    labels = read_label_map(path)
+    if labels.data.shape != like.data.shape:
+        found, expected = (" × ".join(str(n) for n in reversed(v.data.shape)) for v in (labels, like))
         raise InputError(
             f"{path}: the label map has {found} voxels, but the CT has {expected}. Resample it to the CT's grid."
         )
-    corners = torch.cartesian_prod(*(torch.tensor([0.0, n - 1], dtype=torch.float64) for n in reversed(data.shape)))
-    shift = affine - like.lps_from_index
+    last = (torch.tensor([0.0, n - 1], dtype=torch.float64) for n in reversed(like.data.shape))
+    corners = torch.cartesian_prod(*last)
+    shift = labels.lps_from_index - like.lps_from_index
     apart = (corners @ shift[:3, :3].T + shift[:3, 3]).norm(dim=1).max().item()
     if apart > 0.05 * min(like.spacing_mm):
         raise InputError(
             f"{path}: the label map lies on another grid than the CT (its corners are up to {apart:.3g} mm away). "
             "Resample it to the CT's grid."
         )
-    if data.min() < 0 or data.max() > 255 or (data.dtype.kind == "f" and not (data == np.round(data)).all()):
-        raise InputError(f"{path}: whole numbers from 0 to 255 were expected, found {data.min():g} to {data.max():g}.")
-    return Volume(torch.from_numpy(data.astype(np.uint8)), like.lps_from_index)
+    return Volume(labels.data, like.lps_from_index)
 
 
 def write_volume(path: Path, volume: Volume) -> None:

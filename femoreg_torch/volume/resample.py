@@ -21,11 +21,18 @@ def crop(volume: Volume, lo_xyz: tuple[int, int, int], hi_xyz: tuple[int, int, i
     return Volume(volume.data[lo[2] : hi[2], lo[1] : hi[1], lo[0] : hi[0]].contiguous(), affine)
 
 
+def _nearest(size: int, scale: float) -> Tensor:
+    """Which of `size` voxels along one axis each of the new ones lies in."""
+    index = torch.arange(size, dtype=torch.float64)
+    return F.interpolate(index[None, None], scale_factor=scale, mode="nearest-exact")[0, 0].long()
+
+
 def _resize(data: Tensor, scale: tuple[float, float, float], nearest: bool) -> Tensor:
     """`data` (Z, Y, X) with `scale` = new over old number of voxels along x, y, z; outer faces stay where they are."""
     x, y, z = scale
-    if nearest:
-        return F.interpolate(data[None, None], scale_factor=(z, y, x), mode="nearest-exact")[0, 0]
+    if nearest:  # by index, as torch interpolates few of the integer types
+        k, j, i = (_nearest(n, s) for n, s in zip(data.shape, (z, y, x), strict=True))
+        return data[k][:, j][:, :, i]
     # torch has the anti-aliased linear filter (a triangle as wide as the coarser voxel) in 2-D only; it is separable
     flat = F.interpolate(data[:, None], scale_factor=(y, x), mode="bilinear", antialias=True)[:, 0]
     upright = flat.movedim(0, 1)[:, None]  # (Y, 1, Z, X)

@@ -16,46 +16,44 @@ from femoreg_torch.geometry import Camera, centred_camera, exp_se3
 from femoreg_torch.volume.grid import Volume
 
 CAMERA = Camera(900.0, (9.0, 11.0), (11, 9), (4.3, 5.8))  # off centre, pixels and detector not square
+ONE_LARGE_TILE = 16  # the interpreter's time goes by operations, not by rays
 TOLERANCE = 2e-5  # as for the CPU kernels: float32 sums, relative to the largest pixel
-
-
-@pytest.fixture(autouse=True)
-def one_large_tile(monkeypatch):
-    """The interpreter's time goes by operations, not by rays."""
-    monkeypatch.setattr(cuda, "_TILE", 16)
 
 
 def affines(volume: Volume, poses: Tensor) -> Tensor:
     return torch.linalg.inv(poses[:, 0] @ volume.lps_from_index)[:, :3]
 
 
-def by_triton(volume: Volume, poses: Tensor, camera: Camera = CAMERA, step_mm: float = 2.0) -> Tensor:
-    return cuda.project(volume, affines(volume, poses), camera, step_mm)
+def by_triton(
+    volume: Volume, poses: Tensor, camera: Camera = CAMERA, step_mm: float = 2.0, tile: int = ONE_LARGE_TILE
+) -> Tensor:
+    return cuda.project(volume, affines(volume, poses), camera, step_mm, tile)
 
 
-def error(volume: Volume, poses: Tensor, camera: Camera = CAMERA, step_mm: float = 2.0) -> float:
+def error(
+    volume: Volume, poses: Tensor, camera: Camera = CAMERA, step_mm: float = 2.0, tile: int = ONE_LARGE_TILE
+) -> float:
     expected = truth([volume], poses, camera, step_mm)[:, 0]
     assert expected.any()
-    return relative_error(by_triton(volume, poses, camera, step_mm), expected)
+    return relative_error(by_triton(volume, poses, camera, step_mm, tile), expected)
 
 
 @pytest.mark.parametrize("filling", [smooth, sparse])
-def test_turned_volumes_and_tiles_that_overhang_the_detector(filling, monkeypatch):
-    monkeypatch.setattr(cuda, "_TILE", 8)
+def test_turned_volumes_and_tiles_that_overhang_the_detector(filling):
     generator = torch.Generator().manual_seed(1)
     volume = centred(filling((11, 14, 17), generator), (1.6, 2.0, 3.1), (0.3, 0.1, -0.2))
-    assert error(volume, random_poses(1, 1, generator), step_mm=2.3) < TOLERANCE
+    assert error(volume, random_poses(1, 1, generator), step_mm=2.3, tile=8) < TOLERANCE
 
 
-def test_long_empty_stretches(monkeypatch):
+def test_long_empty_stretches():
     """Alone, each of the two parts is met after a leap; tiles see one, both or none of them."""
-    monkeypatch.setattr(cuda, "_TILE", 4)
     generator = torch.Generator().manual_seed(2)
     data = torch.zeros(40, 40, 60)
     data[2:6, 3:8, 4:9] = sparse((4, 5, 5), generator, 0.2)
     data[31:38, 30:34, 50:58] = smooth((7, 4, 8), generator)
     volume = centred(data)
-    assert error(volume, facing(620.0, (0.2, 1.0, 0.1)), centred_camera(900.0, (10.0, 11.0), (6, 7)), 1.0) < TOLERANCE
+    camera = centred_camera(900.0, (10.0, 11.0), (6, 7))
+    assert error(volume, facing(620.0, (0.2, 1.0, 0.1)), camera, 1.0, tile=4) < TOLERANCE
 
 
 def test_empty_space_is_not_read():
@@ -104,7 +102,7 @@ def test_a_pose_that_is_not_sane_gives_nan_and_spoils_no_other(value):
     volume = centred(smooth((5, 5, 5), torch.Generator().manual_seed(6)), (4.0, 4.0, 4.0))
     rows = affines(volume, torch.cat([facing(), facing()]))
     rows[0, 1, 3] = value
-    image = cuda.project(volume, rows, CAMERA, 4.0)
+    image = cuda.project(volume, rows, CAMERA, 4.0, ONE_LARGE_TILE)
     assert image[0].isnan().all()
     assert torch.equal(image[1:], by_triton(volume, facing(), step_mm=4.0))
 
@@ -149,7 +147,8 @@ def test_jacobian_image_agrees_with_the_one_of_the_cpu():
     poses = random_poses(1, 1, generator)
     small = 1e-5 * torch.eye(6, dtype=torch.float64)
     moved = [torch.stack([affines(volume, exp_se3(s) @ poses) for s in steps], 1) for steps in (small, -small)]
-    found = cuda.jacobian(volume, affines(volume, poses), (moved[0] - moved[1]) / 2e-5, CAMERA, 2.0)
+    changes = (moved[0] - moved[1]) / 2e-5
+    found = cuda.jacobian(volume, affines(volume, poses), changes, CAMERA, 2.0, ONE_LARGE_TILE)
     expected = project_with_jacobian(volume, poses[:, 0], CAMERA, float64(0, 0, 0), 2.0)
     assert relative_error(found[0], expected[0].double()) < TOLERANCE
     for dof in range(6):

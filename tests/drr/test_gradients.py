@@ -48,7 +48,7 @@ def test_pose_gradient_agrees_with_autograd_through_the_march(filling):
         twist = torch.zeros(2, 2, 6, dtype=torch.float64, requires_grad=True)
         (render(exp_se3(twist * SCALE) @ poses) * weights).sum().backward()
         gradients.append(twist.grad)
-    assert relative_error(gradients[0], gradients[1]) < 1e-4
+    assert relative_error(gradients[0], gradients[1]) < 2e-5
 
 
 def test_pose_gradient_agrees_with_finite_differences_of_the_march():
@@ -65,7 +65,7 @@ def test_pose_gradient_agrees_with_finite_differences_of_the_march():
             step = torch.zeros_like(expected)
             step[0, volume, dof] = 1e-6
             expected[0, volume, dof] = (loss(step) - loss(-step)) / 2e-6
-    assert relative_error(twist.grad, expected) < 1e-4
+    assert relative_error(twist.grad, expected) < 2e-5
 
 
 def test_pose_gradient_of_separate_images():
@@ -76,7 +76,7 @@ def test_pose_gradient_of_separate_images():
         moving = poses.clone().requires_grad_()
         (render(moving) * weights).sum().backward()
         gradients.append(moving.grad[..., :3, :])
-    assert relative_error(gradients[0], gradients[1]) < 1e-4
+    assert relative_error(gradients[0], gradients[1]) < 2e-5
 
 
 @pytest.mark.parametrize("camera", [CAMERA, DEVIATING_CAMERA], ids=["square", "off centre"])
@@ -103,7 +103,7 @@ def test_jacobian_image_agrees_with_the_gradient():
     moved = about_point(exp_se3(twist), centre) @ poses[:, 0]
     (project(volumes[:1], moved[:, None], CAMERA) * weights).sum().backward()
     expected = torch.einsum("bhw,bhwd->bd", weights, jacobian).double()
-    assert relative_error(expected / SCALE, twist.grad / SCALE) < 1e-4
+    assert relative_error(expected / SCALE, twist.grad / SCALE) < 2e-5
 
 
 def test_volume_gradient_agrees_with_autograd_through_the_march():
@@ -115,7 +115,7 @@ def test_volume_gradient_agrees_with_autograd_through_the_march():
         image = render([volumes[0].with_data(data)], poses[:, :1], CAMERA)
         (image.reshape(weights.shape) * weights).sum().backward()
         gradients.append(data.grad)
-    assert relative_error(gradients[0], gradients[1]) < 1e-5
+    assert relative_error(gradients[0], gradients[1]) < 5e-6
 
 
 def test_volume_gradient_reaches_empty_voxels_and_a_source_inside():
@@ -128,7 +128,7 @@ def test_volume_gradient_reaches_empty_voxels_and_a_source_inside():
             (render([volume], pose, CAMERA).reshape(weights.shape) * weights).sum().backward()
             gradients.append(volume.data.grad)
         assert gradients[1].any()
-        assert relative_error(gradients[0], gradients[1]) < 1e-5
+        assert relative_error(gradients[0], gradients[1]) < 5e-6
 
 
 def test_the_volume_gradient_is_the_adjoint():
@@ -137,7 +137,7 @@ def test_the_volume_gradient_is_the_adjoint():
     data = volumes[0].data.clone().requires_grad_()
     product = (project([volumes[0].with_data(data)], poses[:, :1], CAMERA).double() * weights).sum()
     product.backward()
-    assert_close((data.double() * data.grad).sum(), product, rtol=1e-4, atol=1e-5 * weights.abs().sum().item())
+    assert_close((data.double() * data.grad).sum(), product, rtol=0, atol=1e-7 * weights.abs().sum().item())
 
 
 def test_two_runs_of_the_gradient_agree_bit_for_bit():

@@ -47,8 +47,8 @@ def test_kernels_compile_for_a_gpu(kernel):
     pointers |= dict.fromkeys(("image", "upstream", "out", "gradient"), "*fp32")
     pointers |= {"volume": "*fp16", "leap": "*u8", "tile": "constexpr"}
     signature = {name: pointers.get(name, "i32") for name in function.arg_names}
-    source = triton.compiler.ASTSource(function, signature, {"tile": cuda._TILE})
-    options = {"num_warps": cuda._WARPS, "enable_fp_fusion": True}
+    source = triton.compiler.ASTSource(function, signature, {"tile": cuda.TILE})
+    options = {"num_warps": cuda.WARPS, "enable_fp_fusion": True}
     compiled = triton.compile(source, target=GPUTarget("cuda", 80, 32), options=options)
     assert compiled.asm["cubin"]
 

@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 import torch
 
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
-from femoreg_torch.volume import HIP_LANDMARKS, Volume, axis_aligned, check_inside, read_landmarks, write_landmarks
+from femoreg_torch.volume import Volume, axis_aligned, check_inside, read_landmarks, write_landmarks
 
 HEAD, NOTCH = [97.3, -11.84, -78.18], [-78.68, 13.25, -23.23]  # FH-l is left (+x), GSN-r right, LPS
 RAS_HEAD, RAS_NOTCH = [-97.3, 11.84, -78.18], [78.68, -13.25, -23.23]
@@ -66,10 +67,10 @@ def test_all_formats_give_the_same_lps_points_in_the_same_order(tmp_path: Path, 
 @pytest.mark.parametrize("name", ["points.json", "points.mrk.json"])
 def test_written_landmarks_come_back(tmp_path: Path, name: str) -> None:
     values = torch.randn(14, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    points = dict(zip(HIP_LANDMARKS, values, strict=True))
+    points = dict(zip(HIP.landmark_names, values, strict=True))
     write_landmarks(tmp_path / name, points)
     again = read_landmarks(tmp_path / name)
-    assert tuple(again) == HIP_LANDMARKS
+    assert tuple(again) == HIP.landmark_names
     for key in points:
         torch.testing.assert_close(again[key], points[key], atol=1e-8, rtol=0)
 

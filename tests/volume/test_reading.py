@@ -1,21 +1,27 @@
 """Volumes from files against SimpleITK's own index-to-point transform, and every way in which a file can be wrong."""
 
+import gzip
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 import SimpleITK as sitk
 import torch
 from scipy.spatial.transform import Rotation
 
+from femoreg_torch.anatomy import label_table
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume import (
     Volume,
     axis_aligned,
     check_inside,
+    label_box_centre,
     read_ct,
+    read_label_map,
     read_labels,
     read_landmarks,
+    read_volume,
     structure_attenuation,
     write_volume,
 )
@@ -57,7 +63,7 @@ def test_every_index_order_ends_in_lps_with_its_points_in_place(
     sitk.WriteImage(image, str(tmp_path / f"ct{suffix}"))
     volume = read_ct(tmp_path / f"ct{suffix}")
     assert volume.data.dtype == torch.float32
-    np.testing.assert_allclose(brightest_point(volume), image.TransformIndexToPhysicalPoint(BRIGHT), atol=1e-3)
+    np.testing.assert_allclose(brightest_point(volume), image.TransformIndexToPhysicalPoint(BRIGHT), atol=1e-5)
     cosines = volume.lps_from_index[:3, :3] / torch.tensor(volume.spacing_mm)
     assert (cosines.diagonal() > 0.8).all()  # index axes run along +L, +P, +S
 
@@ -97,7 +103,7 @@ def test_dicom_series(tmp_path: Path) -> None:
     image = write_series(tmp_path / "series")
     volume = read_ct(tmp_path / "series")
     assert tuple(volume.data.shape) == (7, 9, 8)
-    np.testing.assert_allclose(brightest_point(volume), image.TransformIndexToPhysicalPoint(BRIGHT), atol=1e-4)
+    np.testing.assert_allclose(brightest_point(volume), image.TransformIndexToPhysicalPoint(BRIGHT), atol=1e-5)
 
 
 def test_real_headers(data_folder: Path) -> None:
@@ -133,6 +139,9 @@ def damaged(kind: str, folder: Path) -> Path:
         sitk.WriteImage(image + 1024, str(path))
     elif kind == "empty folder":
         path = folder
+    elif kind == "complex":
+        path = folder / "ct.nrrd"
+        sitk.WriteImage(sitk.RealAndImaginaryToComplex(*[sitk.Cast(image, sitk.sitkFloat32)] * 2), str(path))
     elif kind == "two series":
         path = folder / "series"
         write_series(path, "1.2.3")
@@ -153,6 +162,7 @@ def damaged(kind: str, folder: Path) -> Path:
         ("unscaled", "Hounsfield"),
         ("empty folder", "no DICOM series"),
         ("two series", "2 DICOM series"),
+        ("complex", "complex values, but real ones were expected"),
     ],
 )
 def test_bad_ct(tmp_path: Path, kind: str, message: str) -> None:
@@ -161,6 +171,74 @@ def test_bad_ct(tmp_path: Path, kind: str, message: str) -> None:
         read_ct(path)
     assert str(path) in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+def nifti(dtype: str, kind: type = nibabel.Nifti1Image, nan: bool = False) -> nibabel.Nifti1Image:
+    """A CT of bone with one voxel of fat, or of nothing that is a number."""
+    values = np.full((8, 9, 7), 1200, dtype)
+    values[2, 5, 4] = np.nan if nan else -200
+    return kind(values, np.diag([-1.0, -1.0, 2.0, 1.0]), dtype=dtype)
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".hdr"])
+@pytest.mark.parametrize("kind", [nibabel.Nifti1Image, nibabel.Nifti2Image])
+@pytest.mark.parametrize("dtype", ["float32", "float64", ">f4", "complex64", "complex128"])
+def test_values_that_are_not_finite_are_found_in_every_nifti(
+    tmp_path: Path, suffix: str, kind: type, dtype: str
+) -> None:
+    """ITK's own reader would turn them into zero."""
+    pairs = {nibabel.Nifti1Image: nibabel.Nifti1Pair, nibabel.Nifti2Image: nibabel.Nifti2Pair}
+    path = tmp_path / f"ct{suffix}"
+    nibabel.save(nifti(dtype, pairs[kind] if suffix == ".hdr" else kind, nan=True), path)
+    for read in (read_volume, read_label_map):
+        with pytest.raises(InputError, match=r"ct\.(nii|nii\.gz|hdr): holds values that are not finite"):
+            read(path)
+
+
+@pytest.mark.parametrize("suffix", [".mha", ".nrrd"])
+def test_values_that_are_not_finite_are_found_in_label_maps_of_other_formats(tmp_path: Path, suffix: str) -> None:
+    values = np.zeros((3, 4, 5), np.float32)
+    values[1, 1, 1] = np.nan
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(tmp_path / f"labels{suffix}"))
+    with pytest.raises(InputError, match="whole numbers from 0 to 65535"):
+        read_label_map(tmp_path / f"labels{suffix}")
+
+
+@pytest.mark.parametrize("dtype", ["int16", ">i2", "int32", "float32", "float64"])
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz"])
+def test_a_nifti_that_is_cut_off_is_refused(tmp_path: Path, suffix: str, dtype: str) -> None:
+    """ITK's own reader would fill it up with zeros, which as HU are water."""
+    path = tmp_path / f"ct{suffix}"
+    nibabel.save(nifti(dtype), path)
+    content = path.read_bytes()
+    for share in (0.5, 0.9):
+        path.write_bytes(content[: int(share * len(content))])
+        with pytest.raises(InputError, match="cannot be read as NIfTI") as raised:
+            read_volume(path)
+        assert "\n" not in str(raised.value)
+
+
+def test_a_nifti_that_only_claims_to_be_compressed_is_refused(tmp_path: Path) -> None:
+    nibabel.save(nifti("int16"), tmp_path / "ct.nii")
+    (tmp_path / "ct.nii").rename(tmp_path / "ct.nii.gz")
+    with pytest.raises(InputError, match=r"cannot be read as NIfTI \(.*not a gzip file"):
+        read_ct(tmp_path / "ct.nii.gz")
+
+
+def test_a_nifti_compressed_in_several_parts_is_read(tmp_path: Path) -> None:
+    """As by bgzip: the end of the file tells the size of the last part only."""
+    nibabel.save(nifti("int16"), tmp_path / "ct.nii")
+    content = (tmp_path / "ct.nii").read_bytes()
+    (tmp_path / "ct.nii.gz").write_bytes(gzip.compress(content[:500]) + gzip.compress(content[500:]))
+    assert torch.equal(read_ct(tmp_path / "ct.nii.gz").data, read_ct(tmp_path / "ct.nii").data)
+
+
+def test_finite_floats_and_nifti_2(tmp_path: Path) -> None:
+    nibabel.save(nifti("float64"), tmp_path / "ct.nii.gz")
+    assert read_ct(tmp_path / "ct.nii.gz").data.aminmax() == (-200, 1200)
+    nibabel.save(nifti("int16", nibabel.Nifti2Image), tmp_path / "ct2.nii.gz")
+    with pytest.raises(InputError, match="cannot be read as NIfTI-1, NRRD, MHA"):
+        read_ct(tmp_path / "ct2.nii.gz")
 
 
 def label_image(direction: np.ndarray = RIGHT_HANDED["LPS"]) -> sitk.Image:
@@ -176,6 +254,29 @@ def test_labels_in_another_index_order_come_back_on_the_grid_of_the_ct(tmp_path:
     assert torch.equal(labels.data == 5, ct.data > 0)
 
 
+@pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd"])
+@pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float32, np.float64])
+def test_labels_up_to_65535_are_read_and_found(tmp_path: Path, suffix: str, dtype: type) -> None:
+    sitk.WriteImage(ct_image(), str(tmp_path / "ct.nii.gz"))
+    values = sitk.GetArrayFromImage(label_image()).astype(np.int64) * 13107  # 5 becomes 65535
+    values[0, 0, :2] = 300
+    image = sitk.GetImageFromArray(values.astype(dtype))
+    image.CopyInformation(ct_image())
+    sitk.WriteImage(image, str(tmp_path / f"labels{suffix}"))
+    ct = read_ct(tmp_path / "ct.nii.gz")
+    labels = read_labels(tmp_path / f"labels{suffix}", ct)
+    assert labels.data.dtype == torch.int32
+    assert torch.equal(labels.data == 65535, ct.data > 0)
+    assert labels.data.unique().tolist() == [0, 300, 65535]
+    bone = structure_attenuation(ct, labels, [65535], grow_voxels=0)
+    np.testing.assert_allclose(brightest_point(bone), ct_image().TransformIndexToPhysicalPoint(BRIGHT), atol=1e-5)
+    np.testing.assert_allclose(
+        label_box_centre(labels, [65535]), ct_image().TransformIndexToPhysicalPoint(BRIGHT), atol=1e-5
+    )
+    write_volume(tmp_path / "again.nrrd", labels)
+    assert torch.equal(read_labels(tmp_path / "again.nrrd", ct).data, labels.data)
+
+
 def wrong_labels(kind: str) -> sitk.Image:
     labels = label_image()
     if kind == "shape":
@@ -188,6 +289,8 @@ def wrong_labels(kind: str) -> sitk.Image:
         return sitk.Cast(labels, sitk.sitkFloat32) * 0.9
     if kind == "negative":
         return sitk.Cast(labels, sitk.sitkInt16) - 1
+    if kind == "too large":
+        return sitk.Cast(labels, sitk.sitkInt32) * 13108
     return labels
 
 
@@ -199,6 +302,7 @@ def wrong_labels(kind: str) -> sitk.Image:
         ("turned", "another grid"),
         ("fractions", "whole numbers"),
         ("negative", "whole numbers"),
+        ("too large", "whole numbers from 0 to 65535 was expected, found 0 to 65540"),
     ],
 )
 def test_bad_labels(tmp_path: Path, kind: str, message: str) -> None:
@@ -216,7 +320,7 @@ def test_written_volumes_come_back(tmp_path: Path, suffix: str) -> None:
     write_volume(tmp_path / f"ct{suffix}", Volume(data, affine))
     again = read_ct(tmp_path / f"ct{suffix}")
     assert torch.equal(again.data, data)
-    torch.testing.assert_close(again.lps_from_index, affine, atol=1e-4, rtol=0)
+    torch.testing.assert_close(again.lps_from_index, affine, atol=1e-5, rtol=0)
     assert [p.name for p in tmp_path.iterdir()] == [f"ct{suffix}"]
 
 
@@ -227,10 +331,11 @@ def test_real_landmarks_lie_in_the_bones_of_their_side(data_folder: Path) -> Non
     labels = read_labels(folder / "labels.nii.gz", ct)
     landmarks = read_landmarks(folder / "landmarks.json")
     check_inside(landmarks, ct)
-    for name, femur in (("FH-l", 5), ("FH-r", 6)):
+    ids = label_table("femoreg")
+    for name, femur in (("FH-l", "femur_left"), ("FH-r", "femur_right")):
         x, y, z = torch.linalg.solve(ct.lps_from_index, torch.cat([landmarks[name], torch.ones(1)]))[:3].round().long()
-        assert labels.data[z, y, x] == femur
-    left = structure_attenuation(ct, labels, [5]).centre()
+        assert (labels.data[z, y, x],) == ids[femur]
+    left = structure_attenuation(ct, labels, ids["femur_left"]).centre()
     assert left[0] > 0  # patient left is +x
     assert landmarks["ASIS-l"][1] < landmarks["GSN-l"][1]  # back is +y
     assert landmarks["ASIS-l"][2] > landmarks["IPS-l"][2]  # up is +z

@@ -59,11 +59,16 @@ def test_coarser_voxels_are_averages_and_not_samples() -> None:
     torch.testing.assert_close(coarse.data[2:-2, 2:-2, 2:-2], torch.full((16, 16, 16), 500.0))
 
 
-def test_labels_stay_labels() -> None:
+@pytest.mark.parametrize(("dtype", "label"), [(torch.uint8, 5), (torch.int32, 65535)])
+@pytest.mark.parametrize("spacing_mm", [0.43, 1.37])  # where no new voxel lies between two
+def test_labels_stay_labels_each_that_of_the_nearest_voxel(dtype: torch.dtype, label: int, spacing_mm: float) -> None:
     random = torch.rand(10, 10, 10, generator=torch.Generator().manual_seed(0))
-    fine = resample_isotropic(Volume((random > 0.5).to(torch.uint8) * 5, ramp().lps_from_index), 0.4, nearest=True)
-    assert fine.data.dtype == torch.uint8
-    assert set(fine.data.unique().tolist()) == {0, 5}
+    labels = Volume((random > 0.5).to(dtype) * label, ramp().lps_from_index)
+    new = resample_isotropic(labels, spacing_mm, nearest=True)
+    assert new.data.dtype == dtype
+    homogeneous = torch.cat([positions(new), torch.ones(*new.data.shape, 1)], -1).double()
+    x, y, z = (homogeneous @ torch.linalg.inv(labels.lps_from_index).T)[..., :3].round().long().clamp(0, 9).unbind(-1)
+    assert torch.equal(new.data, labels.data[z, y, x])
 
 
 def test_voxels_larger_than_the_volume_are_refused() -> None:
