@@ -21,24 +21,23 @@ class Bobyqa:
     first_step: float = 0.25
     tol_x: float = 1e-4
 
+    def minimise(self, objective: Objective, n: int, seed: int) -> Result:
+        """Minimise over deltas (n,) in [−1, 1]ⁿ, starting from zero; returns the best point met. Nothing is random."""
+        track = BestSoFar(objective)
 
-def minimise_bobyqa(objective: Objective, n: int, settings: Bobyqa) -> Result:
-    """Minimise over deltas (n,) in [−1, 1]ⁿ, starting from zero; returns the best point met."""
-    track = BestSoFar(objective)
+        def value(x: np.ndarray[Any, Any], _gradient: object) -> float:
+            return float(track(torch.from_numpy(x.copy())[None])[0])
 
-    def value(x: np.ndarray[Any, Any], _gradient: object) -> float:
-        return float(track(torch.from_numpy(x.copy())[None])[0])
-
-    search = nlopt.opt(nlopt.LN_BOBYQA, n)
-    search.set_min_objective(value)
-    search.set_lower_bounds(np.full(n, -1.0))
-    search.set_upper_bounds(np.full(n, 1.0))
-    search.set_initial_step(np.full(n, settings.first_step))
-    search.set_xtol_abs(settings.tol_x)
-    search.set_maxeval(settings.max_evaluations)
-    try:
-        search.optimize(np.zeros(n))
-    except nlopt.RoundoffLimited:
-        return track.result(Stop.ROUNDOFF)
-    spent = search.last_optimize_result() == nlopt.MAXEVAL_REACHED
-    return track.result(Stop.BUDGET if spent else Stop.SMALL_STEP)
+        search = nlopt.opt(nlopt.LN_BOBYQA, n)
+        search.set_min_objective(value)
+        search.set_lower_bounds(np.full(n, -1.0))
+        search.set_upper_bounds(np.full(n, 1.0))
+        search.set_initial_step(np.full(n, self.first_step))
+        search.set_xtol_abs(self.tol_x)
+        search.set_maxeval(self.max_evaluations)
+        try:
+            search.optimize(np.zeros(n))
+        except nlopt.RoundoffLimited:
+            return track.result(Stop.ROUNDOFF)
+        spent = search.last_optimize_result() == nlopt.MAXEVAL_REACHED
+        return track.result(Stop.BUDGET if spent else Stop.SMALL_STEP)

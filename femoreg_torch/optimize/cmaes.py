@@ -1,12 +1,16 @@
 """CMA-ES: global enough to find the basin, batched over its population."""
 
+import warnings
 from dataclasses import dataclass
 
-import cma
 import numpy as np
 import torch
 
 from femoreg_torch.optimize.result import BestSoFar, Objective, Result, Stop
+
+with warnings.catch_warnings():  # cma warns where matplotlib is missing, which only its plots need
+    warnings.simplefilter("ignore", UserWarning)
+    import cma
 
 
 @dataclass(frozen=True)
@@ -21,29 +25,28 @@ class CmaEs:
     tol_x: float = 1e-3  # in initial standard deviations
     tol_f: float = 1e-5
 
+    def minimise(self, objective: Objective, n: int, seed: int) -> Result:
+        """Minimise over deltas (n,), starting from zero; returns the best point ever met.
 
-def minimise_cmaes(objective: Objective, n: int, settings: CmaEs, seed: int) -> Result:
-    """Minimise over deltas (n,), starting from zero; returns the best point ever met.
-
-    The final mean of the distribution is evaluated too: on a noisy objective it is often the better point.
-    """
-    track = BestSoFar(objective)
-    options = {
-        "popsize": settings.population,
-        "tolx": settings.tol_x,
-        "tolfun": settings.tol_f,
-        "tolfunhist": settings.tol_f / 10,
-        "maxfevals": settings.max_evaluations,
-        "seed": seed + 1,  # 0 would mean: from the clock
-        "verbose": -9,
-    }
-    strategy = cma.CMAEvolutionStrategy(np.zeros(n), 1.0, options)
-    track(torch.zeros(1, n, dtype=torch.float64))
-    while not (reasons := strategy.stop()):
-        asked = strategy.ask()
-        values = track(torch.from_numpy(np.stack(asked)))
-        strategy.tell(asked, values.tolist())
-    track(torch.from_numpy(strategy.mean)[None])
-    if "maxfevals" in reasons:
-        return track.result(Stop.BUDGET)
-    return track.result(Stop.SMALL_STEP if "tolx" in reasons else Stop.FLAT)
+        The final mean of the distribution is evaluated too: on a noisy objective it is often the better point.
+        """
+        track = BestSoFar(objective)
+        options = {
+            "popsize": self.population,
+            "tolx": self.tol_x,
+            "tolfun": self.tol_f,
+            "tolfunhist": self.tol_f / 10,
+            "maxfevals": self.max_evaluations,
+            "seed": seed + 1,  # 0 would mean: from the clock
+            "verbose": -9,
+        }
+        strategy = cma.CMAEvolutionStrategy(np.zeros(n), 1.0, options)
+        track(torch.zeros(1, n, dtype=torch.float64))
+        while not (reasons := strategy.stop()):
+            asked = strategy.ask()
+            values = track(torch.from_numpy(np.stack(asked)))
+            strategy.tell(asked, values.tolist())
+        track(torch.from_numpy(strategy.mean)[None])
+        if "maxfevals" in reasons:
+            return track.result(Stop.BUDGET)
+        return track.result(Stop.SMALL_STEP if "tolx" in reasons else Stop.FLAT)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from femoreg_torch.optimize.quadratic import Quadratic, SmoothObjective
-from femoreg_torch.optimize.result import BestSoFar, Result, Stop
+from femoreg_torch.optimize.result import BestSoFar, Objective, Result, Stop
 
 _DAMPING = 1e-3  # at the start, relative to the curvature of each degree of freedom
 _SOFTEST = 1e-4  # least curvature that counts, relative to the mean
@@ -28,20 +28,24 @@ class LevenbergMarquardt:
     candidates: int = 0
     starts: int = 1
 
+    def minimise(self, objective: Objective, n: int, seed: int) -> Result:
+        """Minimise over deltas (n,), from zero and from random starts. Evaluations count quadratics and values alike.
 
-def minimise_levenberg_marquardt(objective: SmoothObjective, n: int, settings: LevenbergMarquardt, seed: int) -> Result:
-    """Minimise over deltas (n,), from zero and from random starts. Evaluations count quadratics and values alike."""
-    track = BestSoFar(objective)
-    starts = torch.zeros(1, n, dtype=torch.float64)
-    if settings.candidates:
-        generator = torch.Generator().manual_seed(seed)
-        drawn = torch.randn(settings.candidates, n, generator=generator, dtype=torch.float64)
-        tried = torch.cat([starts, drawn])
-        starts = tried[track(tried).argsort()[: settings.starts]]
-    found = [_descend(track, objective, start, settings) for start in starts]
-    best = min(found, key=lambda end: end.value)
-    ends = tuple((end.value, tuple(end.delta.tolist())) for end in found) if len(found) > 1 else ()
-    return replace(track.result(best.stop), ends=ends)
+        Raises `TypeError` for an objective without derivatives, one that is no `SmoothObjective`.
+        """
+        if not isinstance(objective, SmoothObjective):
+            raise TypeError("Levenberg–Marquardt needs a SmoothObjective")
+        track = BestSoFar(objective)
+        starts = torch.zeros(1, n, dtype=torch.float64)
+        if self.candidates:
+            generator = torch.Generator().manual_seed(seed)
+            drawn = torch.randn(self.candidates, n, generator=generator, dtype=torch.float64)
+            tried = torch.cat([starts, drawn])
+            starts = tried[track(tried).argsort()[: self.starts]]
+        found = [_descend(track, objective, start, self) for start in starts]
+        best = min(found, key=lambda end: end.value)
+        ends = tuple((end.value, tuple(end.delta.tolist())) for end in found) if len(found) > 1 else ()
+        return replace(track.result(best.stop), ends=ends)
 
 
 @dataclass(frozen=True, eq=False)

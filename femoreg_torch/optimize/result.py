@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import Protocol
 
 from torch import Tensor
 
@@ -30,8 +31,18 @@ class Result:
     value: float
     stop: Stop
     evaluations: int
-    trace: tuple[tuple[int, float, tuple[float, ...]], ...]
+    trace: tuple[tuple[int, float, tuple[float, ...]], ...] = ()
     ends: tuple[tuple[float, tuple[float, ...]], ...] = ()
+
+
+class Optimiser(Protocol):
+    """Settings of an optimiser, by convention a frozen dataclass, which presets read by its `kind`."""
+
+    def minimise(self, objective: Objective, n: int, seed: int) -> Result:
+        """Minimise over deltas (n,), starting from zero; the same seed gives the same result.
+
+        The objective of a stage is a `SmoothObjective`, which has derivatives too if the stage's similarity has them.
+        """
 
 
 class BestSoFar:

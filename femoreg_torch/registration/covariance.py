@@ -12,8 +12,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from femoreg_torch.registration.objective import PLAIN, Imaging, Level, image_costs, stage_objective
-from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, reference_point_in_view
+from femoreg_torch.geometry import Poses
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import PLAIN, Imaging, image_costs, stage_objective
+from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
+from femoreg_torch.similarity import Similarity
 
 _UNIT_DEG, _UNIT_MM = 1.0, 1.0
 
@@ -21,6 +24,8 @@ _UNIT_DEG, _UNIT_MM = 1.0, 1.0
 @dataclass(frozen=True, eq=False)
 class PoseCovariance:
     """Covariance (6 B, 6 B) of the motions of B bodies: of every object in camera 1, and of the C-arm of other views.
+
+    Where the C-arm's poses are known, of the objects alone.
 
     A motion is a twist (degrees, mm) along the axes of its camera about the object's reference point, for a C-arm about
     that of the first object.
@@ -46,17 +51,20 @@ class PoseCovariance:
         return float(self.step[i : i + 3].norm()), float(self.step[i + 3 : i + 6].norm())
 
 
-def pose_covariance(scene: Scene, poses: Poses, level: Level, imaging: Imaging = PLAIN) -> PoseCovariance:
+def pose_covariance(
+    scene: Scene, poses: Poses, level: Level, similarity: Similarity, imaging: Imaging = PLAIN
+) -> PoseCovariance:
     """The covariance of all poses at a solution, from the images of every view at one level, drawn with `imaging`."""
     scale = torch.tensor([_UNIT_DEG * torch.pi / 180] * 3 + [_UNIT_MM] * 3, dtype=torch.float64)
     objects = tuple(poses.camera1_from)
+    views = range(len(poses.camera_from_camera1))
+    found = views[1:] if scene.camera_from_camera1 is None else ()
     bodies = [Body((name,), 0, reference_point_in_view(scene, poses, name, 0), scale) for name in objects]
-    others = range(1, len(poses.camera_from_camera1))
-    bodies += [Body((), view, reference_point_in_view(scene, poses, objects[0], view), scale) for view in others]
-    images: list[tuple[Kind, int]] = [(kind, view) for kind in scene.images for view in (0, *others)]
-    costs = image_costs(scene, poses, tuple(bodies), objects, images, level, imaging=imaging)
+    bodies += [Body((), view, reference_point_in_view(scene, poses, objects[0], view), scale) for view in found]
+    images: list[tuple[Kind, int]] = [(kind, view) for kind in scene.images for view in views]
+    costs = image_costs(scene, poses, tuple(bodies), objects, images, level, similarity, imaging=imaging)
     model = stage_objective(costs, tuple(bodies), None).quadratic(torch.zeros(6 * len(bodies), dtype=torch.float64))
     inverse = torch.linalg.pinv(model.hessian, hermitian=True)
     clusters = len(model.scores) / (len(model.scores) - 1)
     matrix = clusters * inverse @ (model.scores.T @ model.scores) @ inverse
-    return PoseCovariance((*objects, *(f"view {view + 1}" for view in others)), matrix, -inverse @ model.gradient)
+    return PoseCovariance((*objects, *(f"view {view + 1}" for view in found)), matrix, -inverse @ model.gradient)

@@ -8,26 +8,16 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from femoreg_torch.drr import project, project_with_jacobian
-from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import downsample
-from femoreg_torch.geometry import Camera, invert_rigid, transform_points
+from femoreg_torch.geometry import Camera, Poses, invert_rigid, transform_points
 from femoreg_torch.optimize import Quadratic, SmoothObjective
-from femoreg_torch.registration.scene import Body, Kind, Poses, RigidObject, Scene, split
+from femoreg_torch.registration.level import Level, binning
+from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene, split
 from femoreg_torch.registration.weights import Weighting, pixel_weights
-from femoreg_torch.similarity import GradNcc, grad_ncc, grad_ncc_quadratic
+from femoreg_torch.similarity import FixedSimilarity, Similarity, similarity_quadratic
+from femoreg_torch.volume import Volume
 
 _STEP = 1e-5  # of a delta, for the derivatives of poses
-_TISSUE_PX = 16  # pixels of the detector between those where the soft tissue is drawn; it is smooth
-_TISSUE_STEP_MM = 3.0
-
-
-@dataclass(frozen=True)
-class Level:
-    """How finely a stage looks."""
-
-    downsample: int
-    step_mm: float
-    patch_radius: int
+_TISSUE = Level(pixel_mm=3.1, step_mm=3.0)  # how finely the soft tissue is drawn; it is smooth
 
 
 @dataclass(frozen=True)
@@ -36,7 +26,7 @@ class Imaging:
 
     `scatter` is the scattered light per primary light behind the patient but for what is drawn: it fills dark shadows,
     so that −log flattens there, and their edges seem to lie farther out. `tissue` is the soft tissue's attenuation in
-    the images per attenuation in the CT (harder light); 0 draws none.
+    the images per attenuation in the CT (harder light); 0 draws none, nor does a scene without a CT.
     """
 
     scatter: float = 0.0
@@ -69,7 +59,7 @@ class _Target:
 
     view: int
     camera: Camera
-    similarity: GradNcc
+    similarity: FixedSimilarity
     background: Tensor  # (H, W), line integrals of all that stands still
     moving: tuple[str, ...]
     tissue: Tensor | None  # (H, W): seen besides, or nothing
@@ -92,12 +82,13 @@ def _target(
     render: Sequence[str],
     image: tuple[Kind, int],
     level: Level,
+    similarity: Similarity,
     weights: Sequence[Weighting],
     imaging: Imaging,
 ) -> _Target:
     kind, view = image
-    camera = scene.carm.camera.downsampled(level.downsample)
-    fixed = downsample(scene.images[kind][view], level.downsample)
+    camera = level.camera(scene.carm.camera)
+    fixed = level.image(scene.images[kind][view], scene.carm.camera)
     drawn = scene.shown(render, kind)
     moves = {name for body in bodies for name in (drawn if body.view == view and body.view else body.objects)}
     still = [name for name in drawn if name not in moves]
@@ -107,19 +98,19 @@ def _target(
         background = project([scene.objects[name].volume for name in still], where, camera, level.step_mm)[0]
     placing = [name for body in bodies for name in body.objects]
     looked_at = pixel_weights(scene, poses, render, placing, image, camera, level.step_mm, weights)
-    similarity = grad_ncc(fixed, level.patch_radius, weights=looked_at)
-    tissue = imaging.tissue * _tissue(scene, poses, view, camera) if imaging.tissue else None
-    return _Target(view, camera, similarity, background, tuple(n for n in drawn if n in moves), tissue, imaging)
+    prepared = similarity.against(fixed, looked_at)
+    tissue = None
+    if imaging.tissue and scene.tissue is not None:
+        tissue = imaging.tissue * _tissue(scene.tissue, poses.camera_from(scene.anchor)[view], camera)
+    return _Target(view, camera, prepared, background, tuple(n for n in drawn if n in moves), tissue, imaging)
 
 
-def _tissue(scene: Scene, poses: Poses, view: int, camera: Camera) -> Tensor:
-    """Line integrals (H, W) of the soft tissue, where the pelvis is: on coarse pixels, and interpolated."""
-    if scene.tissue is None:
-        raise InputError("a stage draws soft tissue (`imaging`), but the scene has none.")
-    factor = max(1, round(_TISSUE_PX * scene.carm.camera.pixel_mm[0] / camera.pixel_mm[0]))
+def _tissue(tissue: Volume, camera_from_tissue: Tensor, camera: Camera) -> Tensor:
+    """Line integrals (H, W) of the soft tissue: on coarse pixels, and interpolated."""
+    factor = binning(_TISSUE.pixel_mm, camera)
     rows, columns = (-(-n // factor) * factor for n in camera.shape)
     wide = replace(camera, shape=(rows, columns)).downsampled(factor)
-    coarse = project([scene.tissue], poses.camera_from("pelvis")[view][None, None], wide, _TISSUE_STEP_MM)
+    coarse = project([tissue], camera_from_tissue[None, None], wide, _TISSUE.step_mm)
     fine = F.interpolate(coarse[None], size=(rows, columns), mode="bicubic", antialias=True)[0, 0]
     return fine[: camera.shape[0], : camera.shape[1]].contiguous()
 
@@ -146,7 +137,7 @@ class ImageCosts:
         return torch.stack(columns, 1)
 
     def quadratics(self, delta: Tensor) -> list[Quadratic]:
-        """Each image's cost about one delta (Σ n_b,), with exact gradient and Gauss–Newton curvature."""
+        """Each image's cost about one delta (Σ n_b,), with exact gradient and positive semi-definite curvature."""
         return [self._quadratic(target, delta) for target in self.targets]
 
     def _placed(self, target: _Target, deltas: Tensor) -> Tensor:
@@ -173,7 +164,7 @@ class ImageCosts:
             twists.append(_twists(change, pose, centre))
         # Six twists per object span all that the deltas do to this image.
         changes = torch.cat(jacobians, -1) * target.imaging.slope(drawn)[..., None]
-        cost, scores, hessian = grad_ncc_quadratic(target.similarity, target.seen(drawn), changes)
+        cost, scores, hessian = similarity_quadratic(target.similarity, target.seen(drawn), changes)
         by_delta = torch.cat(twists)  # (6 O, n)
         return Quadratic(cost, scores @ by_delta, by_delta.T @ hessian @ by_delta)
 
@@ -200,6 +191,7 @@ def image_costs(
     render: Sequence[str],
     images: Sequence[tuple[Kind, int]],
     level: Level,
+    similarity: Similarity,
     weights: Sequence[Weighting] = (),
     imaging: Imaging = PLAIN,
 ) -> ImageCosts:
@@ -208,7 +200,9 @@ def image_costs(
     Objects of `render` that no body moves are drawn once and added. `weights` says which pixels count, see
     `pixel_weights`, by default all. Raises `InputError` for an image that they leave no pixel of.
     """
-    targets = tuple(_target(scene, poses, bodies, render, image, level, weights, imaging) for image in images)
+    targets = tuple(
+        _target(scene, poses, bodies, render, image, level, similarity, weights, imaging) for image in images
+    )
     return ImageCosts(scene.objects, poses, bodies, level.step_mm, targets)
 
 

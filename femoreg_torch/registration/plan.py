@@ -1,124 +1,72 @@
 """A workflow as data: the steps that a preset in `configs/registration/` lists."""
 
-from dataclasses import dataclass, field
-from typing import Any, Literal
-
-from jsonargparse import ArgumentError, ArgumentParser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_type_hints
 
 from femoreg_torch.configs import load_preset
-from femoreg_torch.errors import InputError
-from femoreg_torch.optimize import Bobyqa, CmaEs, LevenbergMarquardt
-from femoreg_torch.registration.objective import PLAIN, Imaging, Level, Prior
-from femoreg_torch.registration.scene import Kind
-from femoreg_torch.registration.weights import Weighting
+from femoreg_torch.extensions import find, pop_kind, record_of
+from femoreg_torch.optimize import Optimiser, read_optimiser
+from femoreg_torch.registration.objective import PLAIN, Imaging
+from femoreg_torch.registration.orbit import OrbitSearch
+from femoreg_torch.registration.stage import Stage
+from femoreg_torch.registration.step import Step
+from femoreg_torch.settings import read_record
+from femoreg_torch.similarity import Similarity, read_similarity
 
-VIEW, VIEWS = "view", "views"
-
-
-@dataclass(frozen=True)
-class BodyPlan:
-    """A body to move: `move` names objects of the scene that move together, or the C-arm of a view.
-
-    [view] is the view at hand in a stage for each other view, [views] stands for one body per view but the first.
-    `rotation_deg` and `translation_mm` are per axis of the camera (x along columns, y along rows, z depth): the
-    standard deviation of random candidates for CMA-ES and Levenberg–Marquardt, the half-width of the box for BOBYQA.
-    Zero freezes an axis.
-    """
-
-    move: list[str]
-    centre: str
-    rotation_deg: list[float]
-    translation_mm: list[float]
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One optimisation. `images` says which views take part: the first, each other view by itself, or all together.
-
-    Objects are named as in the scene. `weights` says which pixels count, see `pixel_weights`; by default all do.
-    `imaging` says what is drawn besides the objects; by default nothing.
-    """
-
-    name: str
-    images: Literal["first", "each other", "all"]
-    kinds: list[Kind]
-    render: list[str]
-    bodies: list[BodyPlan]
-    level: Level
-    optimiser: CmaEs | Bobyqa | LevenbergMarquardt
-    prior: Prior | None = None
-    weights: list[Weighting] = field(default_factory=list)
-    imaging: Imaging = PLAIN
-
-    @property
-    def objects(self) -> set[str]:
-        """The names of all objects that it draws, moves or turns about."""
-        moved = {name for body in self.bodies for name in body.move} - {VIEW, VIEWS}
-        return {*self.render, *moved, *(body.centre for body in self.bodies)}
-
-
-@dataclass(frozen=True)
-class OrbitSearch:
-    """Exhaustive search of every other view along the C-arm's orbit, from the first view, in images of one kind."""
-
-    name: str
-    render: list[str]
-    half_range_deg: float
-    step_deg: float
-    level: Level
-    kind: Kind = "anatomy"
-
-    @property
-    def kinds(self) -> list[Kind]:
-        """The kinds of images that it looks at."""
-        return [self.kind]
-
-    @property
-    def objects(self) -> set[str]:
-        """The names of all objects that it draws."""
-        return set(self.render)
+STEPS = {"stage": Stage, "orbit_search": OrbitSearch}
+_READERS = {Similarity: read_similarity, Optimiser: read_optimiser}  # of fields that say their `kind`
 
 
 @dataclass(frozen=True)
 class Plan:
-    """All steps of a registration, in order. Steps that look at images which a case lacks are left out."""
+    """All steps of a registration, in order. Steps that a case has nothing to do for are left out."""
 
     preset: str
-    steps: tuple[Stage | OrbitSearch, ...]
+    steps: tuple[Step, ...]
+
+    @property
+    def stages(self) -> list[Stage]:
+        """The steps that are optimisations."""
+        return [step for step in self.steps if isinstance(step, Stage)]
 
     @property
     def needs_segmentations(self) -> bool:
         """Whether a stage weighs pixels by what the network sees in every view."""
-        return any(isinstance(step, Stage) and "bones" in step.weights for step in self.steps)
+        return any("bones" in stage.weights for stage in self.stages)
 
     @property
     def imaging(self) -> Imaging:
         """What the last stage takes the images to be."""
-        return next((step.imaging for step in reversed(self.steps) if isinstance(step, Stage)), PLAIN)
+        return self.stages[-1].imaging if self.stages else PLAIN
 
 
-def load_plan(preset: str) -> Plan:
-    """The workflow `configs/registration/<preset>.yaml`. Raises `InputError` that names preset, step and key."""
-    return plan_from(preset, load_preset("registration", preset))
+def load_plan(preset: str | Path) -> Plan:
+    """The workflow `configs/registration/<preset>.yaml`, or that of a YAML file.
+
+    Raises `InputError` that names preset, step and key.
+    """
+    return plan_from(str(preset), load_preset("registration", preset))
 
 
 def plan_from(name: str, content: dict[str, Any]) -> Plan:
     """The workflow of this name whose `steps` stand in `content`. Raises `InputError` that names it, step and key."""
-    return Plan(
-        name,
-        tuple(_step(step, f"registration preset {name}, step {i + 1}") for i, step in enumerate(content["steps"])),
-    )
+    where = f"registration preset {name}"
+    steps = read_record(_Content, content, where).steps
+    return Plan(name, tuple(_step(step, f"{where}, step {i + 1}") for i, step in enumerate(steps)))
 
 
-def _step(content: dict[str, Any], where: str) -> Stage | OrbitSearch:
-    kind = OrbitSearch if "half_range_deg" in content else Stage
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_class_arguments(kind)
-    try:
-        step = kind(**vars(parser.instantiate(parser.parse_object(content))))
-    except (ArgumentError, TypeError) as error:
-        raise InputError(f"{where}: {' '.join(str(error).split())}") from error
-    for body in getattr(step, "bodies", []):
-        if len(body.rotation_deg) != 3 or len(body.translation_mm) != 3:
-            raise InputError(f"{where}: rotation_deg and translation_mm need three numbers, one per camera axis.")
+@dataclass(frozen=True)
+class _Content:
+    """What a preset holds."""
+
+    steps: list[dict[str, Any]]
+
+
+def _step(content: dict[str, Any], where: str) -> Step:
+    kind, rest = pop_kind(content, where)
+    record = record_of(find("femoreg_torch.steps", kind, STEPS, where), where)
+    readers = {name: _READERS[hint] for name, hint in get_type_hints(record).items() if hint in _READERS}
+    ready = {name: read(rest.pop(name), f"{where}, {name}") for name, read in readers.items() if name in rest}
+    step: Step = read_record(record, rest, where, ready)
     return step

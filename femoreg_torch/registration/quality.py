@@ -1,7 +1,7 @@
 """Can a registration be trusted? Asked of every object in every view, without knowing the truth.
 
-Signs of a wrong pose are measured at the solution. First, what the image gains when the object is drawn: a bone
-or a device that is not where it is drawn explains little of the image. Second, where each view by itself would move the
+Signs of a wrong pose are measured at the solution. First, what the image gains when the object is drawn: one
+that is not where it is drawn explains little of the image. Second, where each view by itself would move the
 object in its own image plane: views that pull in different directions contradict each other, or their common geometry.
 Third, where all views together would move it, were everything free: what a stage held in a wrong place, the C-arm, say,
 moves then. Fourth, the standard deviations of the pose (`registration.covariance`), depth included. Fifth, how far it
@@ -13,13 +13,17 @@ from dataclasses import dataclass
 
 import torch
 
-from femoreg_torch.geometry import invert_rigid, pose_difference
+from femoreg_torch.case.quality import ObjectQuality, ViewQuality
+from femoreg_torch.case.trace import StageRecord
+from femoreg_torch.geometry import Poses, pose_difference
 from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
-from femoreg_torch.registration.objective import PLAIN, Imaging, Level, image_costs
-from femoreg_torch.registration.scene import Body, Kind, Poses, Scene, reference_point_in_view
-from femoreg_torch.registration.workflow import StepTrace
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import PLAIN, Imaging, image_costs
+from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
+from femoreg_torch.similarity import GradNcc
 
-_LEVEL = Level(downsample=8, step_mm=0.5, patch_radius=5)
+_LEVEL = Level(pixel_mm=1.55, step_mm=0.5)
+_SIMILARITY = GradNcc(patch_radius=5)
 _PROBE_MM = 0.6  # about half a pixel of the level, at the object
 
 
@@ -36,41 +40,19 @@ class Limits:
     rival_cost: float = 0.005  # another start of a stage that ended so little above the best,
     rival_deg: float = 15.0  # but so far away
     rival_mm: float = 50.0  # or so far, is a rival; what is nearer, the following stages tell apart
-    most_displacement_mm: float = 8.0  # of an object of the CT beside the first one; joints do not gape so far
-
-
-@dataclass(frozen=True)
-class ViewQuality:
-    """One object in one image."""
-
-    view: int  # from 1
-    similarity: float  # mean patch Grad-NCC of the image with all objects drawn, at most 1
-    gain: float  # what drawing this object adds to it
-    pull_mm: tuple[float, float]  # where this view alone would move the object, along its columns and rows
-
-
-@dataclass(frozen=True)
-class ObjectQuality:
-    """One object in all views."""
-
-    views: tuple[ViewQuality, ...]
-    in_plane_uncertainty_mm: float  # root mean square disagreement of the views in their image planes
-    common_pull: tuple[float, float]  # degrees, mm: where all images together would move it, were all free
-    rotation_deviation_deg: tuple[float, ...]  # standard deviations about the axes of camera 1
-    translation_deviation_mm: tuple[float, ...]  # and along them, of the reference point
-    displacement: tuple[float, float] | None  # degrees, mm from where it was expected, at the reference point
-    trusted: bool
-    reason: str
+    most_displacement_mm: float = (
+        8.0  # from the place beside the object that it starts beside; joints do not gape so far
+    )
 
 
 def assess(
-    scene: Scene, poses: Poses, limits: Limits, imaging: Imaging = PLAIN, trace: Sequence[StepTrace] = ()
+    scene: Scene, poses: Poses, limits: Limits, imaging: Imaging = PLAIN, trace: Sequence[StageRecord] = ()
 ) -> dict[str, ObjectQuality]:
     """Quality of every object placed in `poses`, in the first kind of images that shows it, drawn with `imaging`.
 
     `trace` is that of the steps which led there.
     """
-    covariance = pose_covariance(scene, poses, _LEVEL, imaging)
+    covariance = pose_covariance(scene, poses, _LEVEL, _SIMILARITY, imaging)
     return {name: _assess_object(scene, poses, name, covariance, limits, imaging, trace) for name in poses.camera1_from}
 
 
@@ -81,9 +63,9 @@ def _assess_object(
     covariance: PoseCovariance,
     limits: Limits,
     imaging: Imaging,
-    trace: Sequence[StepTrace],
+    trace: Sequence[StageRecord],
 ) -> ObjectQuality:
-    kind = scene.objects[name].shown_in[0]
+    kind = next(kind for kind in scene.objects[name].shown_in if kind in scene.images)
     views = tuple(_assess_view(scene, poses, name, (kind, view), imaging) for view in range(len(scene.images[kind])))
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
@@ -94,7 +76,7 @@ def _assess_object(
         _reason(name, views, limits)
         or _unsettled(name, pull, limits)
         or _vague(name, rotation, translation, limits)
-        or _out_of_joint(scene, name, displacement, limits)
+        or _displaced(scene, name, displacement, limits)
         or _rivalled(name, trace, limits)
     )
     told = reason or "all views agree"
@@ -104,22 +86,22 @@ def _assess_object(
 
 
 def _displacement(scene: Scene, poses: Poses, name: str) -> tuple[float, float] | None:
-    """How far an object lies from its nominal pose, or from where the CT has it beside its first object."""
-    expected = scene.objects[name].camera1_from
-    if expected is None:
-        first = next(other for other in poses.camera1_from if scene.objects[other].camera1_from is None)
-        if name == first:
-            return None
-        expected = poses.camera1_from[first]
+    """How far an object lies from its nominal pose, or from its place beside another object, wherever that is now."""
+    start = scene.objects[name].start
+    if start.camera1_from is not None:
+        expected = start.camera1_from
+    elif start.beside is not None:
+        expected = poses.camera1_from[start.beside] @ start.beside_from_object
+    else:
+        return None
     return pose_difference(expected, poses.camera1_from[name], scene.objects[name].reference_point)
 
 
-def _out_of_joint(scene: Scene, name: str, displacement: tuple[float, float] | None, limits: Limits) -> str | None:
-    if displacement is None or scene.objects[name].camera1_from is not None:
-        return None  # nothing joins a device to the patient
-    if displacement[1] <= limits.most_displacement_mm:
-        return None
-    return f"the {name} lies {displacement[1]:.1f} mm from where the CT has it"
+def _displaced(scene: Scene, name: str, displacement: tuple[float, float] | None, limits: Limits) -> str | None:
+    start = scene.objects[name].start
+    if displacement is None or start.camera1_from is not None or displacement[1] <= limits.most_displacement_mm:
+        return None  # how far from its nominal pose an object may lie, nobody knows
+    return f"the {name} lies {displacement[1]:.1f} mm from its place beside the {start.beside}"
 
 
 def _unsettled(name: str, pull: tuple[float, float], limits: Limits) -> str | None:
@@ -150,7 +132,7 @@ def _reason(name: str, views: Sequence[ViewQuality], limits: Limits) -> str | No
     return None
 
 
-def _rivalled(name: str, trace: Sequence[StepTrace], limits: Limits) -> str | None:
+def _rivalled(name: str, trace: Sequence[StageRecord], limits: Limits) -> str | None:
     for step in trace:
         for end in step.restarts if name in step.moving else ():
             if end.cost < limits.rival_cost and (end.apart_deg > limits.rival_deg or end.apart_mm > limits.rival_mm):
@@ -163,20 +145,18 @@ def _rivalled(name: str, trace: Sequence[StepTrace], limits: Limits) -> str | No
 
 def _assess_view(scene: Scene, poses: Poses, name: str, image: tuple[Kind, int], imaging: Imaging) -> ViewQuality:
     kind, view = image
-    here = poses.camera_from_camera1[view]
-    # The same geometry with this view as the frame that all else is tied to, so that a delta acts along its axes.
-    local = Poses(
-        poses.camera_from_camera1 @ invert_rigid(here), {n: here @ pose for n, pose in poses.camera1_from.items()}
-    )
+    local = poses.seen_from(view)  # so that a delta acts along the axes of this view
     centre = reference_point_in_view(scene, local, name, view)
     scale = torch.tensor([0, 0, 0, _PROBE_MM, _PROBE_MM, 0], dtype=torch.float64)
     body = Body((name,), 0, centre, scale)
     drawn = scene.shown(poses.camera1_from, kind)
     probes = torch.tensor([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=torch.float64)
-    costs = image_costs(scene, local, (body,), drawn, [image], _LEVEL, imaging=imaging)(probes)[:, 0].tolist()
+    costs = image_costs(scene, local, (body,), drawn, [image], _LEVEL, _SIMILARITY, imaging=imaging)(probes)[
+        :, 0
+    ].tolist()
     others = [n for n in drawn if n != name]
     nothing = torch.zeros(1, 0, dtype=torch.float64)
-    without = image_costs(scene, local, (), others, [image], _LEVEL, imaging=imaging)(nothing)
+    without = image_costs(scene, local, (), others, [image], _LEVEL, _SIMILARITY, imaging=imaging)(nothing)
     pull = (_minimum(costs[1], costs[0], costs[2]) * _PROBE_MM, _minimum(costs[3], costs[0], costs[4]) * _PROBE_MM)
     return ViewQuality(view + 1, 1 - costs[0], float(without[0, 0]) - costs[0], pull)
 

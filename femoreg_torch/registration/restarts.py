@@ -1,23 +1,14 @@
 """Do the starts of an optimisation agree? Another end that fits as well makes the best one doubtful."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from femoreg_torch.geometry import pose_difference
+from femoreg_torch.case.trace import Restart
+from femoreg_torch.geometry import Poses, pose_difference
 from femoreg_torch.optimize import Result
-from femoreg_torch.registration.scene import Body, Poses, Scene
-
-
-@dataclass(frozen=True)
-class Restart:
-    """Where one start of an optimisation ended, against the best end of all."""
-
-    cost: float  # above the best
-    apart_deg: float  # the greatest over all that the stage moves
-    apart_mm: float  # of the reference point
+from femoreg_torch.registration.scene import Body, Scene
 
 
 def restarts_of(

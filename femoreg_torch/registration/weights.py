@@ -10,12 +10,13 @@ from torch.nn import functional as F
 
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import Camera, project_points
-from femoreg_torch.registration.scene import Kind, Poses, Scene, Segmentation
+from femoreg_torch.geometry import Camera, Poses, project_points
+from femoreg_torch.registration.scene import Kind, Scene, Segmentation
 
 # bones: the objects that the stage draws, where the network sees them. What the network does not know (an instrument)
 # counts where it is drawn at its present pose.
-# clear: nothing behind an instrument that the stage does not move. Instruments are what the anatomy images do not hold.
+# clear: nothing behind an instrument that the stage does not move. Instruments are what the first kind of images
+# does not hold.
 Weighting = Literal["bones", "clear"]
 
 # On the detector. All chosen here: the segmentation errs by a few mm, and a gradient patch needs both sides of an edge;
@@ -49,7 +50,7 @@ def pixel_weights(
         looked_at &= _bones(scene, poses, scene.shown(render, kind), view, camera, step_mm)
     if "clear" in weights:
         placed = scene.shown(poses.camera1_from, kind)
-        still = [name for name in placed if "anatomy" not in scene.objects[name].shown_in and name not in moving]
+        still = [name for name in placed if scene.first_kind not in scene.objects[name].shown_in and name not in moving]
         looked_at &= ~dilated(_silhouette(scene, poses, still, view, camera, step_mm), _SHADOW_MARGIN_MM, camera)
     if not looked_at.any():
         raise InputError(

@@ -1,8 +1,19 @@
-"""Image similarities: each is prepared with a fixed image and then maps moving images (B, H, W) to costs (B,)."""
+"""Image similarities: settings that, prepared with a fixed image, map moving images (B, H, W) to costs (B,)."""
 
-from femoreg_torch.similarity.curvature import grad_ncc_quadratic
-from femoreg_torch.similarity.grad_ncc import GradNcc, grad_ncc
-from femoreg_torch.similarity.ncc import Ncc, ncc
-from femoreg_torch.similarity.orientation import GradientOrientation, gradient_orientation
+from femoreg_torch.similarity.grad_ncc import GradNcc
+from femoreg_torch.similarity.interface import FixedSimilarity, Similarity, SmoothFixedSimilarity
+from femoreg_torch.similarity.kinds import read_similarity
+from femoreg_torch.similarity.ncc import Ncc
+from femoreg_torch.similarity.orientation import GradientOrientation
+from femoreg_torch.similarity.quadratic import similarity_quadratic
 
-__all__ = ["GradNcc", "GradientOrientation", "Ncc", "grad_ncc", "grad_ncc_quadratic", "gradient_orientation", "ncc"]
+__all__ = [
+    "FixedSimilarity",
+    "GradNcc",
+    "GradientOrientation",
+    "Ncc",
+    "Similarity",
+    "SmoothFixedSimilarity",
+    "read_similarity",
+    "similarity_quadratic",
+]

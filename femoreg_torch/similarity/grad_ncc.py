@@ -7,16 +7,49 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from femoreg_torch.errors import InputError
 from femoreg_torch.similarity import cpu
-from femoreg_torch.similarity.kernels import derivative_taps, image_gradients, patch_sums, patch_weights
+from femoreg_torch.similarity.checks import check_patches, check_size, check_weights
+from femoreg_torch.similarity.curvature import patch_curvature
+from femoreg_torch.similarity.kernels import FLAT, derivative_taps, image_gradients, patch_sums, patch_weights
+from femoreg_torch.similarity.quadratic import tile_scores
 
-FLAT = 1e-10  # sum of squared deviations below which a patch counts as flat: line integrals are of order 1
+_TILE = 4  # patches along the edge of a tile: so large that the tiles' shares are nearly independent
+_STRIDE = 4  # the curvature is summed over every so many-th patch in both directions
+
+
+@dataclass(frozen=True)
+class GradNcc:
+    """Patch Grad-NCC: both images are smoothed by a Gaussian of `smoothing_px` and differentiated by Sobel.
+
+    NCC is taken over every patch of (2 · patch_radius + 1)² pixels that lies wholly inside, and averaged over patches,
+    weighted, and over both derivatives. A patch that is flat in either image has NCC 0. xReg:
+    xregImgSimMetric2DPatchGradNCC (smoothing 1.1 px is its 5 × 5 kernel); Grupp et al., IEEE TBME 67 (2020) 441.
+    """
+
+    patch_radius: int = 5
+    smoothing_px: float = 1.1
+
+    def against(self, fixed: Tensor, weights: Tensor | None = None) -> "FixedGradNcc":
+        """Prepare with the fixed image (H, W); a patch weighs what its pixels' `weights` (H, W) are on average.
+
+        Raises `InputError` if no patch fits or all weights are zero.
+        """
+        radius = self.patch_radius
+        check_patches(fixed, radius)
+        check_weights(fixed, weights)
+        taps = derivative_taps(self.smoothing_px, fixed.device)
+        maps = image_gradients(fixed[None], taps)[0]
+        n = (2 * radius + 1) ** 2
+        mean = patch_sums(maps, radius) / n
+        spread = patch_sums(maps**2, radius) - n * mean**2
+        scale = torch.where(spread > FLAT, spread.clamp(min=FLAT).rsqrt(), torch.zeros_like(spread))
+        share = patch_weights(weights, (fixed.shape[0], fixed.shape[1]), radius).to(mean.device)
+        return FixedGradNcc(maps, mean, scale, share, radius, taps)
 
 
 @dataclass(frozen=True, eq=False)
-class GradNcc:
-    """Patch Grad-NCC against one fixed image; made by `grad_ncc`."""
+class FixedGradNcc:
+    """Patch Grad-NCC against one fixed image; made by `GradNcc.against`."""
 
     fixed: Tensor  # (2, H, W) derivatives
     mean: Tensor  # (2, H − 2r, W − 2r) of each fixed patch
@@ -27,15 +60,30 @@ class GradNcc:
 
     def __call__(self, images: Tensor) -> Tensor:
         """Costs (B,) in [0, 2] of images (B, H, W), float64: mean over patches and both derivatives of 1 − NCC."""
-        if images.shape[1:] != self.fixed.shape[1:]:
-            raise InputError(
-                f"similarity: images are {tuple(images.shape[1:])}, the fixed one {tuple(self.fixed.shape[1:])}."
-            )
+        check_size(images, self.fixed)
         if images.device.type == "cpu" and images.dtype == torch.float32:
             value: Tensor = _CpuGradNcc.apply(images, self)
         else:
             value = self._reference(images)
         return 1 - value
+
+    def quadratic(self, image: Tensor, jacobian: Tensor) -> tuple[float, Tensor, Tensor]:
+        """Cost, scores (T, n) and Gauss–Newton hessian (n, n), see `SmoothFixedSimilarity`; the gradient is exact."""
+        moving = image[None].clone().requires_grad_()
+        cost = self(moving)[0]
+        (slope,) = torch.autograd.grad(cost, moving)
+        changes = jacobian.movedim(-1, 0)  # (n, H, W)
+        scores = tile_scores(changes, slope, _TILE * (2 * self.radius + 1))
+        return cost.item(), scores, self.curvature(image, changes, _STRIDE)
+
+    def curvature(self, image: Tensor, changes: Tensor, stride: int) -> Tensor:
+        """Gauss–Newton hessian (n, n) float64 about an image (H, W) with changes (n, H, W); every stride-th patch."""
+        maps = image_gradients(torch.cat([image[None], changes]), self.taps)  # (1 + n, 2, H, W)
+        along_columns, along_rows = (
+            patch_curvature(maps[0, d], maps[1:, d], self.fixed[d], self.scale[d], self.weights, self.radius, stride)
+            for d in range(2)
+        )
+        return (along_columns + along_rows) / 2  # the cost is the mean over both derivatives
 
     def _reference(self, images: Tensor) -> Tensor:
         """Weighted mean NCC (B,) in plain torch."""
@@ -50,40 +98,17 @@ class GradNcc:
         return (ncc * self.weights).sum((-2, -1)).mean(-1)
 
 
-def grad_ncc(fixed: Tensor, radius: int, smoothing_px: float = 1.1, weights: Tensor | None = None) -> GradNcc:
-    """Patch Grad-NCC against the fixed image (H, W), as a function of moving images (B, H, W).
-
-    Both images are smoothed by a Gaussian of `smoothing_px` and differentiated by Sobel; NCC is taken over every
-    patch of (2 · radius + 1)² pixels that lies wholly inside, and averaged, weighted by `weights` (H, W) if given. A
-    patch that is flat in either image has NCC 0. xReg: xregImgSimMetric2DPatchGradNCC (smoothing 1.1 px is its 5 × 5
-    kernel); Grupp et al., IEEE TBME 67 (2020) 441. Raises `InputError` if no patch fits or all weights are zero.
-    """
-    height, width = fixed.shape
-    if min(height, width) < 2 * radius + 1:
-        raise InputError(f"similarity: no patch of radius {radius} fits into a {height} × {width} image.")
-    if weights is not None and not (weights > 0).any():
-        raise InputError("similarity: all pixel weights are zero; the mask leaves nothing to compare.")
-    taps = derivative_taps(smoothing_px, fixed.device)
-    maps = image_gradients(fixed[None], taps)[0]
-    n = (2 * radius + 1) ** 2
-    mean = patch_sums(maps, radius) / n
-    spread = patch_sums(maps**2, radius) - n * mean**2
-    scale = torch.where(spread > FLAT, spread.clamp(min=FLAT).rsqrt(), torch.zeros_like(spread))
-    share = patch_weights(weights, (height, width), radius).to(mean.device)
-    return GradNcc(maps, mean, scale, share, radius, taps)
-
-
 class _CpuGradNcc(torch.autograd.Function):
     """The compiled weighted mean NCC (B,) of images (B, H, W)."""
 
     @staticmethod
-    def _arguments(similarity: GradNcc) -> tuple[Any, ...]:
+    def _arguments(similarity: FixedGradNcc) -> tuple[Any, ...]:
         average, slope = (taps.float().numpy() for taps in similarity.taps)
         numbers = (t.numpy() for t in (similarity.fixed, similarity.mean, similarity.scale, similarity.weights))
         return *numbers, similarity.radius, FLAT, average, slope
 
     @staticmethod
-    def forward(ctx: Any, images: Tensor, similarity: GradNcc) -> Tensor:
+    def forward(ctx: Any, images: Tensor, similarity: FixedGradNcc) -> Tensor:
         ctx.save_for_backward(images)
         ctx.similarity = similarity
         values = cpu.grad_ncc(images.detach().contiguous().numpy(), *_CpuGradNcc._arguments(similarity))

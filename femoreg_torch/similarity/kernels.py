@@ -8,6 +8,8 @@ from torch import Tensor
 
 from femoreg_torch.similarity import cpu
 
+FLAT = 1e-10  # sum of squared deviations below which a patch counts as flat: line integrals are of order 1
+
 
 def derivative_taps(smoothing_px: float, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
     """Taps (K,) float64 across and along a derivative: Sobel's [1, 2, 1] / 4 and [−1, 0, 1] / 2, each smoothed.

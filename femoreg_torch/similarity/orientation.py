@@ -6,12 +6,39 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.similarity.checks import check_size, check_weights
 from femoreg_torch.similarity.kernels import derivative_taps, image_gradients
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class GradientOrientation:
-    """Gradient orientation against one fixed image; made by `gradient_orientation`."""
+    """Mean of (2 − ln(|Δθ| + 1)) / 2 over the pixels whose gradient is above the fixed image's median.
+
+    Nothing where it is not above the median in the moving image. De Silva et al., 3D–2D image registration for target
+    localization in spine surgery, Phys. Med. Biol. 61 (2016) 3009.
+    """
+
+    smoothing_px: float = 1.1  # standard deviation of a Gaussian, before Sobel
+
+    def against(self, fixed: Tensor, weights: Tensor | None = None) -> "FixedGradientOrientation":
+        """Prepare with the fixed image (H, W); `weights` (H, W) say where to look.
+
+        Raises `InputError` if the fixed image has no edge there.
+        """
+        check_weights(fixed, weights)
+        taps = derivative_taps(self.smoothing_px, fixed.device)
+        maps = image_gradients(fixed[None], taps)[0]
+        strength = maps.square().sum(0)
+        strong = (strength > strength.median()) & (strength > 0)
+        share = torch.ones_like(fixed) if weights is None else weights.to(fixed)
+        if not (strong & (share > 0)).any():
+            raise InputError("similarity: the fixed image has no edge where it is to be compared.")
+        return FixedGradientOrientation(maps, strong, share, taps)
+
+
+@dataclass(frozen=True, eq=False)
+class FixedGradientOrientation:
+    """Gradient orientation against one fixed image; made by `GradientOrientation.against`."""
 
     fixed: Tensor  # (2, H, W) derivatives
     strong: Tensor  # (H, W) bool: edges of the fixed image that count
@@ -23,10 +50,7 @@ class GradientOrientation:
 
         An edge of the fixed image where the moving one is flat agrees by nothing.
         """
-        if images.shape[1:] != self.fixed.shape[1:]:
-            raise InputError(
-                f"similarity: images are {tuple(images.shape[1:])}, the fixed one {tuple(self.fixed.shape[1:])}."
-            )
+        check_size(images, self.fixed)
         moving = image_gradients(images, self.taps)  # (B, 2, H, W)
         strength = moving.detach().square().sum(1)
         counts = self.strong & (strength > strength.flatten(1).median(1).values[:, None, None]) & (strength > 0)
@@ -37,22 +61,3 @@ class GradientOrientation:
         agreement = (2 - torch.log(angle + 1)).clamp(min=0) / 2
         share = self.weights * self.strong
         return 1 - (torch.where(counts, agreement, torch.zeros_like(agreement)) * share).sum((1, 2)) / share.sum()
-
-
-def gradient_orientation(
-    fixed: Tensor, smoothing_px: float = 1.1, weights: Tensor | None = None
-) -> GradientOrientation:
-    """Gradient orientation against the fixed image (H, W), as a function of moving images (B, H, W).
-
-    Mean of (2 − ln(|Δθ| + 1)) / 2 over the pixels whose gradient is above the image's median, nothing where it is not
-    in the moving one; De Silva et al., 3D–2D image registration for target localization in spine surgery, Phys. Med.
-    Biol. 61 (2016) 3009. `weights` (H, W) say where to look. Raises `InputError` if the fixed image has no edge there.
-    """
-    taps = derivative_taps(smoothing_px, fixed.device)
-    maps = image_gradients(fixed[None], taps)[0]
-    strength = maps.square().sum(0)
-    strong = (strength > strength.median()) & (strength > 0)
-    share = torch.ones_like(fixed) if weights is None else weights.to(fixed)
-    if not (strong & (share > 0)).any():
-        raise InputError("similarity: the fixed image has no edge where it is to be compared.")
-    return GradientOrientation(maps, strong, share, taps)

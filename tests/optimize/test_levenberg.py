@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective, Stop, minimise
+from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective, Stop
 
 
 def squares(residuals) -> SmoothObjective:  # type: ignore[no-untyped-def]
@@ -32,7 +32,7 @@ def waves(delta: Tensor) -> Tensor:
 
 
 def test_follows_rosenbrocks_valley_to_its_end() -> None:
-    result = minimise(squares(rosenbrock), 2, LevenbergMarquardt(max_iterations=60, tol_x=1e-7, tol_f=1e-14), seed=0)
+    result = LevenbergMarquardt(max_iterations=60, tol_x=1e-7, tol_f=1e-14).minimise(squares(rosenbrock), 2, seed=0)
     torch.testing.assert_close(result.delta, torch.tensor([2.2, 0.0], dtype=torch.float64), atol=1e-5, rtol=0)
     assert result.stop in (Stop.SMALL_STEP, Stop.FLAT)
     assert result.evaluations < 60
@@ -40,8 +40,8 @@ def test_follows_rosenbrocks_valley_to_its_end() -> None:
 
 
 def test_one_start_stays_in_its_valley_and_the_best_of_many_does_not() -> None:
-    alone = minimise(squares(waves), 2, LevenbergMarquardt(), seed=0)
-    scattered = minimise(squares(waves), 2, LevenbergMarquardt(candidates=200, starts=40), seed=0)
+    alone = LevenbergMarquardt().minimise(squares(waves), 2, seed=0)
+    scattered = LevenbergMarquardt(candidates=200, starts=40).minimise(squares(waves), 2, seed=0)
     assert alone.value > 0.05
     torch.testing.assert_close(scattered.delta, torch.tensor([2.0, -1.0], dtype=torch.float64), atol=1e-3, rtol=0)
     assert alone.ends == ()
@@ -51,19 +51,19 @@ def test_one_start_stays_in_its_valley_and_the_best_of_many_does_not() -> None:
 
 def test_scales_of_very_different_stiffness_do_not_matter() -> None:
     stiffness = torch.tensor([1e3, 1.0, 0.05], dtype=torch.float64)
-    result = minimise(squares(lambda d: stiffness * (d - 1)), 3, LevenbergMarquardt(tol_f=1e-14), seed=0)
+    result = LevenbergMarquardt(tol_f=1e-14).minimise(squares(lambda d: stiffness * (d - 1)), 3, seed=0)
     torch.testing.assert_close(result.delta, torch.ones(3, dtype=torch.float64), atol=1e-4, rtol=0)
 
 
 def test_the_budget_is_a_reason_to_stop() -> None:
-    result = minimise(squares(rosenbrock), 2, LevenbergMarquardt(max_iterations=2), seed=0)
+    result = LevenbergMarquardt(max_iterations=2).minimise(squares(rosenbrock), 2, seed=0)
     assert result.stop is Stop.BUDGET
     assert result.evaluations == 3
 
 
 def test_same_seed_same_bits() -> None:
     settings = LevenbergMarquardt(candidates=20, starts=3)
-    first, again, other = (minimise(squares(waves), 2, settings, seed) for seed in (0, 0, 1))
+    first, again, other = (settings.minimise(squares(waves), 2, seed) for seed in (0, 0, 1))
     assert torch.equal(first.delta, again.delta)
     assert first.trace == again.trace
     assert first.trace != other.trace
@@ -71,4 +71,4 @@ def test_same_seed_same_bits() -> None:
 
 def test_needs_derivatives() -> None:
     with pytest.raises(TypeError, match="SmoothObjective"):
-        minimise(lambda deltas: deltas.square().sum(1), 2, LevenbergMarquardt(), seed=0)
+        LevenbergMarquardt().minimise(lambda deltas: deltas.square().sum(1), 2, seed=0)

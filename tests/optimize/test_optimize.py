@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from femoreg_torch.optimize import Bobyqa, CmaEs, Settings, Stop, minimise
+from femoreg_torch.optimize import Bobyqa, CmaEs, Optimiser, Stop
 
 MINIMUM = torch.tensor([0.3, -0.2, 0.5, 0.1, -0.4, 0.2], dtype=torch.float64)
 SETTINGS = [CmaEs(population=20, max_evaluations=4000), Bobyqa()]
@@ -23,20 +23,20 @@ def ripples(deltas: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("settings", SETTINGS)
-def test_finds_the_minimum_of_a_bowl(settings: Settings) -> None:
-    result = minimise(bowl, 6, settings, seed=1)
+def test_finds_the_minimum_of_a_bowl(settings: Optimiser) -> None:
+    result = settings.minimise(bowl, 6, seed=1)
     torch.testing.assert_close(result.delta, MINIMUM, atol=2e-3, rtol=0)
     assert result.value == pytest.approx(2, abs=1e-3)
     assert result.stop in (Stop.SMALL_STEP, Stop.FLAT)
 
 
 def test_cma_es_crosses_local_minima() -> None:
-    result = minimise(ripples, 6, CmaEs(population=60, max_evaluations=8000), seed=0)
+    result = CmaEs(population=60, max_evaluations=8000).minimise(ripples, 6, seed=0)
     torch.testing.assert_close(result.delta, MINIMUM, atol=1e-2, rtol=0)
 
 
 @pytest.mark.parametrize("settings", SETTINGS)
-def test_result_is_the_best_point_met_and_the_trace_falls(settings: Settings) -> None:
+def test_result_is_the_best_point_met_and_the_trace_falls(settings: Optimiser) -> None:
     met: list[float] = []
 
     def watched(deltas: Tensor) -> Tensor:
@@ -44,7 +44,7 @@ def test_result_is_the_best_point_met_and_the_trace_falls(settings: Settings) ->
         met.extend(values.tolist())
         return values
 
-    result = minimise(watched, 6, settings, seed=3)
+    result = settings.minimise(watched, 6, seed=3)
     assert result.value == min(met) == result.trace[-1][1]
     assert result.evaluations == len(met)
     assert [value for _, value, _ in result.trace] == sorted((value for _, value, _ in result.trace), reverse=True)
@@ -52,26 +52,26 @@ def test_result_is_the_best_point_met_and_the_trace_falls(settings: Settings) ->
 
 def test_same_seed_same_bits_other_seed_another_path() -> None:
     settings = CmaEs(population=12, max_evaluations=300)
-    first, again, other = (minimise(bowl, 6, settings, seed) for seed in (0, 0, 1))
+    first, again, other = (settings.minimise(bowl, 6, seed) for seed in (0, 0, 1))
     assert torch.equal(first.delta, again.delta)
     assert first.trace == again.trace
     assert not torch.equal(first.delta, other.delta)
 
 
 @pytest.mark.parametrize("settings", [CmaEs(population=10, max_evaluations=50), Bobyqa(max_evaluations=20)])
-def test_the_budget_is_kept(settings: Settings) -> None:
-    result = minimise(ripples, 6, settings, seed=0)
+def test_the_budget_is_kept(settings: Optimiser) -> None:
+    result = settings.minimise(ripples, 6, seed=0)
     assert result.stop is Stop.BUDGET
     assert result.evaluations <= settings.max_evaluations + 12  # a generation, the start and the mean
 
 
 def test_bobyqa_stays_in_its_box() -> None:
-    result = minimise(lambda d: ((d - 3) ** 2).sum(-1), 2, Bobyqa(), seed=0)
+    result = Bobyqa().minimise(lambda d: ((d - 3) ** 2).sum(-1), 2, seed=0)
     torch.testing.assert_close(result.delta, torch.ones(2, dtype=torch.float64), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("settings", SETTINGS)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # cma takes the mean of nothing on its way
-def test_an_objective_that_is_never_finite_is_an_error(settings: Settings) -> None:
+def test_an_objective_that_is_never_finite_is_an_error(settings: Optimiser) -> None:
     with pytest.raises((ArithmeticError, ValueError, RuntimeError)):
-        minimise(lambda d: torch.full((len(d),), torch.nan, dtype=torch.float64), 2, settings, seed=0)
+        settings.minimise(lambda d: torch.full((len(d),), torch.nan, dtype=torch.float64), 2, seed=0)

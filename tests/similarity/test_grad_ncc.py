@@ -4,16 +4,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from pictures import picture
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.similarity import grad_ncc
+from femoreg_torch.similarity import GradNcc
 from femoreg_torch.similarity.kernels import derivative_taps, image_gradients, patch_sums
-
-
-def picture(seed: int, height: int = 40, width: int = 33) -> Tensor:
-    generator = np.random.default_rng(seed)
-    return torch.from_numpy(cv2.GaussianBlur(generator.random((height, width), np.float32), (0, 0), 2.0))
 
 
 def literal_cost(fixed: Tensor, moving: Tensor, radius: int) -> float:
@@ -31,7 +27,7 @@ def literal_cost(fixed: Tensor, moving: Tensor, radius: int) -> float:
 
 def test_equals_the_literal_definition() -> None:
     fixed, moving = picture(0), picture(1)
-    cost = grad_ncc(fixed, 3, smoothing_px=0)(moving[None])
+    cost = GradNcc(3, smoothing_px=0).against(fixed)(moving[None])
     assert float(cost) == pytest.approx(literal_cost(fixed, moving, 3), abs=1e-5)
 
 
@@ -53,26 +49,26 @@ def test_patch_sums_equal_direct_sums() -> None:
 
 def test_a_perfect_match_costs_nothing_whatever_its_scale_and_offset() -> None:
     fixed = picture(3)
-    costs = grad_ncc(fixed, 4)(torch.stack([fixed, 3 * fixed + 7, -fixed]))
+    costs = GradNcc(4).against(fixed)(torch.stack([fixed, 3 * fixed + 7, -fixed]))
     torch.testing.assert_close(costs, torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64), atol=1e-5, rtol=0)
 
 
 def test_flat_patches_count_as_uncorrelated_and_have_no_gradient() -> None:
     fixed = picture(4)
     nothing = torch.zeros(1, *fixed.shape, requires_grad=True)
-    cost = grad_ncc(fixed, 4)(nothing)
+    cost = GradNcc(4).against(fixed)(nothing)
     cost.sum().backward()
     assert cost.item() == 1.0
     assert nothing.grad is not None
     assert not nothing.grad.any()
-    assert float(grad_ncc(torch.zeros(20, 20), 3)(picture(5, 20, 20)[None])) == 1.0
+    assert float(GradNcc(3).against(torch.zeros(20, 20))(picture(5, 20, 20)[None])) == 1.0
 
 
 def test_compiled_and_plain_torch_agree_in_value_and_gradient() -> None:
     fixed = picture(6)
     fixed[:12] = 0.4  # flat patches too
     moving = torch.stack([picture(7), picture(8), fixed])
-    similarity = grad_ncc(fixed, 3)
+    similarity = GradNcc(3).against(fixed)
     fast, slow = moving.clone().requires_grad_(), moving.double().requires_grad_()
     upstream = torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
     a, b = similarity(fast), similarity(slow)
@@ -85,13 +81,13 @@ def test_compiled_and_plain_torch_agree_in_value_and_gradient() -> None:
 
 
 def test_gradient_equals_finite_differences() -> None:
-    similarity = grad_ncc(picture(9, 17, 15), 2)
+    similarity = GradNcc(2).against(picture(9, 17, 15))
     image = picture(10, 17, 15)[None].double().requires_grad_()
     torch.autograd.gradcheck(similarity, (image,), eps=1e-5, atol=1e-6)
 
 
 def test_a_batch_gives_what_each_image_gives_alone() -> None:
-    similarity = grad_ncc(picture(11), 3)
+    similarity = GradNcc(3).against(picture(11))
     batch = torch.stack([picture(seed) for seed in range(5)])
     alone = torch.cat([similarity(image[None]) for image in batch])
     assert torch.equal(similarity(batch), alone)
@@ -103,8 +99,8 @@ def test_weights_choose_where_images_are_compared() -> None:
     moving[:, 16:] = picture(13)[:, 16:]  # right half wrong
     left = torch.zeros_like(fixed)
     left[:, :9] = 1  # patches that touch it end before the wrong half
-    assert float(grad_ncc(fixed, 2, weights=left)(moving[None])) < 1e-5
-    assert float(grad_ncc(fixed, 2)(moving[None])) > 0.2
+    assert float(GradNcc(2).against(fixed, left)(moving[None])) < 1e-5
+    assert float(GradNcc(2).against(fixed)(moving[None])) > 0.2
 
 
 @pytest.mark.parametrize(
@@ -113,9 +109,9 @@ def test_weights_choose_where_images_are_compared() -> None:
 )
 def test_nothing_to_compare_is_said(weights: Tensor | None, radius: int, says: str) -> None:
     with pytest.raises(InputError, match=says):
-        grad_ncc(picture(14), radius, weights=weights)
+        GradNcc(radius).against(picture(14), weights)
 
 
 def test_an_image_of_another_size_is_refused() -> None:
     with pytest.raises(InputError, match="images are"):
-        grad_ncc(picture(15), 3)(torch.zeros(1, 8, 8))
+        GradNcc(3).against(picture(15))(torch.zeros(1, 8, 8))

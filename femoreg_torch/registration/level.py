@@ -1,0 +1,40 @@
+"""How finely a stage looks: pixels of a physical size on the detector, whatever the pixels of the images."""
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import downsample
+from femoreg_torch.geometry import Camera
+
+
+@dataclass(frozen=True)
+class Level:
+    """How finely a stage looks."""
+
+    pixel_mm: float  # edge of a pixel on the detector, as nearly as whole multiples of the images' pixels allow
+    step_mm: float  # along the rays
+
+    def __post_init__(self) -> None:
+        if not (self.pixel_mm > 0 and self.step_mm > 0):
+            raise InputError(f"level: pixel_mm and step_mm must be positive, got {self.pixel_mm} and {self.step_mm}.")
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera of images at this level, given that of the images."""
+        return camera.downsampled(binning(self.pixel_mm, camera))
+
+    def image(self, image: Tensor, camera: Camera) -> Tensor:
+        """An image (H, W) of the given camera, averaged to this level."""
+        return downsample(image, binning(self.pixel_mm, camera))
+
+
+def binning(pixel_mm: float, camera: Camera) -> int:
+    """By which whole factor to average a camera's pixels so that their edge, on a log scale, is nearest to `pixel_mm`.
+
+    The edge of pixels that are no squares is the geometric mean of their sides.
+    """
+    ratio = pixel_mm / math.sqrt(camera.pixel_mm[0] * camera.pixel_mm[1])
+    below = max(1, math.floor(ratio))
+    return below if ratio**2 <= below * (below + 1) else below + 1

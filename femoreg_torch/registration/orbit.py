@@ -1,0 +1,87 @@
+"""Exhaustive search of the other views along the C-arm's orbit."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.case.trace import StageRecord
+from femoreg_torch.drr import project
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import Poses, orbit_angles
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.scene import Kind, Scene
+from femoreg_torch.registration.step import (
+    CARM_IS_KNOWN,
+    ONE_VIEW,
+    check_placed,
+    chosen_kinds,
+    chosen_objects,
+    lacking,
+)
+from femoreg_torch.similarity import Similarity
+
+
+@dataclass(frozen=True)
+class OrbitSearch:
+    """Exhaustive search of every other view along the C-arm's orbit, from the first view.
+
+    Costs are the mean over the images of the given kinds; [all] in `kinds` or `render` stands for all.
+    """
+
+    name: str
+    kinds: list[Kind]
+    render: list[str]
+    half_range_deg: float
+    step_deg: float
+    level: Level
+    similarity: Similarity
+
+    def left_out(self, scene: Scene, poses: Poses) -> str | None:
+        """Why it has nothing to do, see `Step`. Raises `InputError` without the images that it needs."""
+        if scene.views == 1:
+            return ONE_VIEW
+        if scene.camera_from_camera1 is not None:
+            return CARM_IS_KNOWN
+        if reason := lacking(chosen_kinds(self.kinds, scene), scene):
+            raise InputError(f"it finds the C-arm of the other views, but {reason}. Choose another preset.")
+        check_placed(chosen_objects(self.render, poses), poses)
+        return None
+
+    def run(self, scene: Scene, poses: Poses, seed: int) -> Iterator[StageRecord]:
+        """One search for every other view, see `Step`; nothing is random."""
+        for view in range(1, scene.views):
+            record = search_orbit(scene, poses, self, view)
+            poses = record.poses
+            yield record
+
+
+def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> StageRecord:
+    """Place the C-arm of one view (from 0) at the angle of its orbit, from view 1, that fits its images best."""
+    began = time.perf_counter()
+    orbit = scene.carm.orbit(orbit_angles(search.half_range_deg, search.step_deg))  # (N, 4, 4)
+    costs = [_costs(scene, poses, search, kind, view, orbit) for kind in chosen_kinds(search.kinds, scene)]
+    values = torch.stack(costs).mean(0)  # (N,)
+    best = int(values.argmin())
+    seconds = time.perf_counter() - began
+    return StageRecord(
+        search.name,
+        view + 1,
+        float(values[best]),
+        len(orbit),
+        seconds,
+        "all angles tried",
+        poses.with_view(view, orbit[best]),
+    )
+
+
+def _costs(scene: Scene, poses: Poses, search: OrbitSearch, kind: Kind, view: int, orbit: Tensor) -> Tensor:
+    """Costs (N,) of one image with the C-arm at the poses `orbit` (N, 4, 4)."""
+    names = scene.shown(chosen_objects(search.render, poses), kind)
+    where = torch.stack([orbit @ poses.camera1_from[name] for name in names], 1)  # (N, O, 4, 4)
+    camera = search.level.camera(scene.carm.camera)
+    drawn = project([scene.objects[name].volume for name in names], where, camera, search.level.step_mm)
+    fixed = search.level.image(scene.images[kind][view], scene.carm.camera)
+    return search.similarity.against(fixed, None)(drawn)

@@ -1,0 +1,28 @@
+"""What a similarity refuses to compare."""
+
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+
+
+def check_patches(fixed: Tensor, radius: int) -> None:
+    """Raise `InputError` if no patch of (2 · radius + 1)² pixels fits into the fixed image (H, W)."""
+    height, width = fixed.shape
+    if min(height, width) < 2 * radius + 1:
+        raise InputError(f"similarity: no patch of radius {radius} fits into a {height} × {width} image.")
+
+
+def check_weights(fixed: Tensor, weights: Tensor | None) -> None:
+    """Raise `InputError` for pixel weights that are not of the fixed image's size (H, W) or all zero."""
+    if weights is None:
+        return
+    if weights.shape != fixed.shape:
+        raise InputError(f"similarity: weights are {tuple(weights.shape)}, the fixed image {tuple(fixed.shape)}.")
+    if not (weights > 0).any():
+        raise InputError("similarity: all pixel weights are zero; the mask leaves nothing to compare.")
+
+
+def check_size(images: Tensor, fixed: Tensor) -> None:
+    """Raise `InputError` for images (B, H, W) that are not of the size of the fixed one (..., H, W)."""
+    if images.shape[1:] != fixed.shape[-2:]:
+        raise InputError(f"similarity: images are {tuple(images.shape[1:])}, the fixed one {tuple(fixed.shape[-2:])}.")

@@ -1,0 +1,63 @@
+"""Any similarity about one image as a quadratic of pose parameters.
+
+For those without a formula of their own: the gradient by automatic differentiation, and as curvature Jᵀ (∂²c/∂I²) J by
+differentiating twice, where J are the derivatives of the image I by the parameters: the generalised Gauss–Newton matrix
+(Schraudolph, Fast curvature matrix-vector products for second-order gradient descent, Neural Computation 14 (2002)
+1723). Where the similarity is not convex its eigenvalues are replaced by their absolute values (Dauphin et al.,
+Identifying and attacking the saddle point problem in high-dimensional non-convex optimization, NeurIPS 2014).
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.similarity.interface import FixedSimilarity, SmoothFixedSimilarity
+
+_TILE_PX = 44  # edge of a tile; as that of Grad-NCC with patches of radius 5
+
+
+def similarity_quadratic(similarity: FixedSimilarity, image: Tensor, jacobian: Tensor) -> tuple[float, Tensor, Tensor]:
+    """Cost, scores (T, n) and positive semi-definite hessian (n, n), float64, of a similarity about an image (H, W).
+
+    `jacobian` (H, W, n) holds the image's derivatives, see `SmoothFixedSimilarity`. Raises `InputError` for a
+    similarity that cannot be differentiated twice.
+    """
+    if isinstance(similarity, SmoothFixedSimilarity):
+        return similarity.quadratic(image, jacobian)
+    moving = image[None].clone().requires_grad_()
+    changes = jacobian.movedim(-1, 0)  # (n, H, W)
+    try:
+        cost = similarity(moving)[0]
+        (slope,) = torch.autograd.grad(cost, moving, create_graph=True)
+        along = (changes * slope).sum((1, 2))  # (n,): the gradient
+        bent = [torch.autograd.grad(part, moving, retain_graph=True)[0] for part in along]  # Hessian-vector products
+    except RuntimeError as error:
+        raise _not_smooth(similarity, " ".join(str(error).split())) from error
+    scores = tile_scores(changes, slope.detach(), _TILE_PX)
+    hessian = changes.flatten(1).to(torch.float64) @ torch.cat(bent).flatten(1).to(torch.float64).T
+    if not (torch.isfinite(hessian).all() and torch.isfinite(scores).all()):
+        raise _not_smooth(similarity, "its derivatives are not finite")
+    if scores.any() and not hessian.any():
+        raise _not_smooth(similarity, "its second derivative is zero")
+    return cost.item(), scores, _without_negative_curvature(hessian)
+
+
+def tile_scores(changes: Tensor, slope: Tensor, tile: int) -> Tensor:
+    """The gradient by square tiles, (T, n) float64: of an image that changes by (n, H, W) and slopes by (1, H, W)."""
+    return (
+        F.avg_pool2d(changes[:, None] * slope, tile, ceil_mode=True, divisor_override=1).flatten(1).T.to(torch.float64)
+    )
+
+
+def _without_negative_curvature(hessian: Tensor) -> Tensor:
+    """The same eigenvectors with the absolute values of the eigenvalues, (n, n)."""
+    values, vectors = torch.linalg.eigh((hessian + hessian.T) / 2)
+    return (vectors * values.abs()) @ vectors.T
+
+
+def _not_smooth(similarity: FixedSimilarity, reason: str) -> InputError:
+    return InputError(
+        f"similarity {type(similarity).__name__}: cannot be differentiated twice ({reason}). "
+        "Choose an optimiser without derivatives, such as cma_es or bobyqa, or give it a `quadratic` of its own."
+    )
