@@ -1,55 +1,161 @@
-"""Writing files so that a run which fails leaves nothing half-written behind."""
+"""Writing files and folders that appear whole or not at all, whatever happens to the run that writes them."""
 
+import errno
+import fcntl
+import glob
 import json
 import math
+import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.exchange import exchange
+
+_RANDOM_PART = "????????"  # of a name by tempfile.mkdtemp
+_SUFFIX = ".part"
+_LOCK, _NEW, _OLD = "lock", "new", "old"  # what a workshop holds: a lock, what is being written, what it replaces
 
 
 @contextmanager
 def temporary_file(path: Path) -> Iterator[Path]:
-    """A path beside `path` with the same suffixes, to be written by the caller and renamed to `path` at success.
+    """A path of the same name in a hidden folder beside `path`; what the caller writes there is renamed to `path`.
 
-    Raises `InputError` if the folder of `path` does not exist.
+    If the block fails, `path` is as it was. Raises `InputError` if the folder of `path` does not exist.
     """
     if not path.parent.is_dir():
         raise InputError(f"{path}: cannot be written, there is no folder {path.parent}. Make it first.")
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        part = Path(folder) / path.name
+    with _workshop(path) as workshop:
+        part = workshop / _NEW / path.name
         yield part
         part.replace(path)
 
 
 @contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder beside `path` that takes its place when the block ends without an exception.
+def new_folder(path: Path, without: Collection[str] = ()) -> Iterator[Path]:
+    """An empty folder to be filled, which takes the place of `path` when the block ends without an exception.
 
-    If `path` exists already, what was built replaces the entries of the same names and leaves all others alone; if the
-    block fails, nothing of `path` has changed. Raises `InputError` if `path` is a file.
+    If `path` exists already, its entries stay, but for those that were written anew (a folder as a whole) and those
+    whose names are in `without`. Old and new folder are exchanged in one step: a run that is killed leaves all of the
+    old or all of the new. Files that stay are linked, not copied, where the file system can. If the block fails,
+    nothing of `path` has changed.
+
+    Where a system or file system cannot exchange two folders (other than Linux; NFS), the old one is renamed away and
+    the new one in: a run that is killed between the two leaves no `path`, and the next writer brings the old back.
+
+    As the folder is another one afterwards, a shell that stands in it has to enter it again (`cd .`).
+
+    Raises `InputError` if `path` is a file, or cannot be renamed because it is a mount point.
     """
     path = path.resolve()  # so that the name and the parent of `.` and `out/..` are real ones
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file, a folder was expected. Choose another name for the output.")
+    if path.is_mount():
+        raise InputError(f"{path}: is a mount point, which cannot be replaced as a whole. Choose a folder inside it.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-        built = Path(folder) / path.name
+    with _workshop(path) as workshop:
+        built = workshop / _NEW / path.name
         built.mkdir()
         yield built
+        if path.exists():
+            _keep_others(path, built, without)
+        _put_in_place(built, path, workshop / _OLD)
+
+
+def _keep_others(old: Path, built: Path, without: Collection[str]) -> None:
+    """Bring the entries of the folder `old` that `built` lacks, and that are not in `without`, into `built`."""
+    for entry in old.iterdir():
+        target = built / entry.name
+        if entry.name in without or os.path.lexists(target):
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.copytree(entry, target, symlinks=True, copy_function=_link)
+        else:
+            _link(entry, target)
+    shutil.copymode(old, built)
+
+
+def _link(source: str | Path, target: str | Path) -> None:
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError:  # no links on this file system, or not for another user's file
+        shutil.copy2(source, target, follow_symlinks=False)
+
+
+def _put_in_place(built: Path, path: Path, old: Path) -> None:
+    """Rename `built` to `path`; a folder that is there already ends as `built`, by way of `old` if need be."""
+    inside = _working_folder(path)
+    try:
         if not path.exists():
-            built.replace(path)
-            return
-        for entry in sorted(built.iterdir()):
-            target = path / entry.name
-            if target.is_dir() and not target.is_symlink():
-                shutil.rmtree(target)
-            entry.replace(target)
+            built.rename(path)
+        elif not exchange(built, path):
+            path.rename(old)
+            built.rename(path)
+            old.rename(built)  # so that it is not taken for one to be brought back
+    except OSError as error:
+        if error.errno not in (errno.EXDEV, errno.EBUSY):
+            raise
+        raise InputError(
+            f"{path}: cannot be replaced as a whole ({error.strerror}). Choose a folder that is not there yet."
+        ) from error
+    if inside is not None and inside.is_dir():
+        os.chdir(inside)  # or relative paths would mean the old folder
+
+
+def _working_folder(path: Path) -> Path | None:
+    """The working folder of this process if it lies in `path`."""
+    try:
+        here = Path.cwd()
+    except FileNotFoundError:
+        return None
+    return here if here.is_relative_to(path) else None
+
+
+@contextmanager
+def _workshop(path: Path) -> Iterator[Path]:
+    """A hidden folder beside `path` with an empty folder `new` in it, locked while this block runs, then removed.
+
+    What killed writers of `path` left is removed first. They are told from live ones by the lock, which the system
+    takes from a process that ends.
+    """
+    _clear_leftovers(path)
+    while True:
+        workshop = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=_SUFFIX, dir=path.parent))
+        try:
+            lock = os.open(workshop / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
+        except FileNotFoundError:  # another writer took the empty folder for a leftover
+            continue
+        with suppress(OSError):  # a file system without locks: nobody can lock there, so nothing is ever cleared
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        if (workshop / _LOCK).exists():
+            break
+        os.close(lock)
+    try:
+        (workshop / _NEW).mkdir()
+        yield workshop
+    finally:
+        shutil.rmtree(workshop, ignore_errors=True)  # what cannot be removed now is a leftover
+        os.close(lock)
+
+
+def _clear_leftovers(path: Path) -> None:
+    """Remove the workshops of killed writers of `path`; a folder that one had renamed away is brought back first."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.{_RANDOM_PART}{_SUFFIX}"):
+        try:
+            lock = os.open(left / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
+        except OSError:  # gone meanwhile, or another user's
+            continue
+        with suppress(OSError):  # somebody holds the lock: a live writer
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if (left / _OLD).is_dir() and not path.exists():
+                (left / _OLD).rename(path)
+            shutil.rmtree(left, ignore_errors=True)
+        os.close(lock)
 
 
 def write_text(path: Path, text: str) -> None:

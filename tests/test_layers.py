@@ -7,7 +7,9 @@ may import from its own room and from those before it.
 import ast
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -19,10 +21,12 @@ MAY_IMPORT = {
     "sim": {"femoreg_torch", "sim"},
     "training": {"models", "femoreg_torch", "sim", "training"},
 }
-# The order that the data takes, from file to report. `case` stands early: it knows files, geometry and landmarks
-# only, and `registration` takes a `Case`. `evaluation` compares a result with the case's truth, so it comes late.
+# What everything stands on, then the order that the data takes, from file to report. `case` stands early: it knows
+# anatomy, geometry and volumes only, and `registration` takes a `Case`. `evaluation` compares a result with the case's
+# truth, so it comes late.
 ROOMS = (
-    "errors", "files", "configs", "geometry", "volume", "drr", "fluoro", "case",
+    "errors", "exchange", "files", "extras", "configs", "settings", "extensions", "anatomy",
+    "geometry", "volume", "drr", "fluoro", "case",
     "detect", "pnp", "similarity", "optimize", "registration", "navigation", "evaluation", "commands",
 )  # fmt: skip
 
@@ -88,6 +92,26 @@ def test_no_room_of_the_library_imports_a_later_one() -> None:
             other = room(name)
             if own and other:
                 assert ROOMS.index(other) <= ROOMS.index(own), f"{path.relative_to(ROOT)} imports {name}"
+
+
+@pytest.mark.parametrize("package", ["models", "sim", "training"])
+def test_the_rooms_of_the_other_packages_import_one_way_too(package: str) -> None:
+    """Whatever their order is: no ring of imports between sub-packages."""
+    rooms = {path.name for path in (ROOT / package).iterdir() if (path / "__init__.py").is_file()}
+    needs: dict[str, set[str]] = {name: set() for name in rooms}
+    for path in modules(package):
+        own, *_ = path.relative_to(ROOT / package).parts
+        others = {name.split(".")[1] for name, _ in imports(path) if name.startswith(f"{package}.")}
+        if own in rooms:
+            needs[own] |= (others & rooms) - {own}
+    TopologicalSorter(needs).prepare()  # raises CycleError, which names the ring
+
+
+def test_every_package_is_installed() -> None:
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
+    folders = {path.parent for package in MAY_IMPORT for path in modules(package) if path.name == "__init__.py"}
+    found = {".".join(folder.relative_to(ROOT).parts) for folder in folders}
+    assert set(listed) == found | {"femoreg_torch.configs"}  # which is the folder configs/
 
 
 @pytest.fixture

@@ -1,22 +1,35 @@
 """Case folders and results: one directory describes one procedure, and every command reads and writes it."""
 
-from femoreg_torch.case.model import DEVICE_POINTS, STRUCTURES, Case, Device, Truth, View
+from femoreg_torch.case.model import Case, CaseObject, Model, PlannedPath, Side, Start, View
+from femoreg_torch.case.quality import ObjectQuality, ViewQuality
 from femoreg_torch.case.reading import read_case
-from femoreg_torch.case.result import RESULT_NAME, read_result
+from femoreg_torch.case.result import LandmarkRecord, Result, StartRecord
+from femoreg_torch.case.result_file import RESULT_NAME, read_result, result_content
+from femoreg_torch.case.trace import StageRecord
+from femoreg_torch.case.verdict import Verdict
 from femoreg_torch.case.writing import write_case
 from femoreg_torch.files import new_folder, write_json, write_text
 
 __all__ = [
-    "DEVICE_POINTS",
     "RESULT_NAME",
-    "STRUCTURES",
     "Case",
-    "Device",
-    "Truth",
+    "CaseObject",
+    "LandmarkRecord",
+    "Model",
+    "ObjectQuality",
+    "PlannedPath",
+    "Result",
+    "Side",
+    "StageRecord",
+    "Start",
+    "StartRecord",
+    "Verdict",
     "View",
+    "ViewQuality",
     "new_folder",
     "read_case",
     "read_result",
+    "result_content",
     "write_case",
     "write_json",
     "write_text",

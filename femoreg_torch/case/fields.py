@@ -44,14 +44,14 @@ class Fields:
         """The mapping under `key`."""
         value = self.value(key, "a mapping")
         if not isinstance(value, dict):
-            raise InputError(f"{self.where(key)}: a mapping of keys and values was expected, found {value!r}.")
+            raise InputError(f"{self.where(key)}: a mapping of keys and values was expected, found {_short(value)}.")
         return Fields(value, self.file, f"{self.path}.{key}" if self.path else key)
 
     def mappings(self, key: str) -> list["Fields"]:
         """The list of mappings under `key`."""
         value = self.value(key, "a list")
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-            raise InputError(f"{self.where(key)}: a list of mappings was expected, found {value!r}.")
+            raise InputError(f"{self.where(key)}: a list of mappings was expected, found {_short(value)}.")
         prefix = f"{self.path}.{key}" if self.path else key
         return [Fields(item, self.file, f"{prefix}[{n}]") for n, item in enumerate(value)]
 
@@ -59,12 +59,31 @@ class Fields:
         """One of the `allowed` words under `key`."""
         value = self.value(key, " or ".join(allowed))
         if value not in allowed:
-            raise InputError(f"{self.where(key)}: {' or '.join(allowed)} was expected, found {value!r}.")
+            raise InputError(f"{self.where(key)}: {' or '.join(allowed)} was expected, found {_short(value)}.")
         return value
+
+    def text(self, key: str, expected: str) -> str:
+        """The text under `key`; `expected` says in words what should stand there."""
+        value = self.value(key, expected)
+        if not isinstance(value, str) or not value:
+            raise InputError(f"{self.where(key)}: {expected} was expected, found {_short(value)}.")
+        return value
+
+    def texts(self, key: str, expected: str) -> list[str]:
+        """One text, or a list of texts, under `key`."""
+        value = self.value(key, expected)
+        items = value if isinstance(value, list) else [value]
+        if not items or not all(isinstance(item, str) and item for item in items):
+            raise InputError(f"{self.where(key)}: {expected} was expected, found {_short(value)}.")
+        return items
 
     def number(self, key: str) -> float:
         """The finite number under `key`."""
         return self._numbers(key, (), "a number").item()
+
+    def numbers(self, key: str, count: int) -> list[float]:
+        """So many finite numbers under `key`."""
+        return self._numbers(key, (count,), f"{count} numbers").tolist()
 
     def point(self, key: str) -> Tensor:
         """The point (3,), float64, under `key`."""
@@ -78,7 +97,7 @@ class Fields:
         """The list of rigid transforms under `key` as (V, 4, 4), float64."""
         value = self.value(key, "a list of 4×4 matrices")
         if not isinstance(value, list) or not value:
-            raise InputError(f"{self.where(key)}: a list of 4×4 matrices was expected, found {value!r}.")
+            raise InputError(f"{self.where(key)}: a list of 4×4 matrices was expected, found {_short(value)}.")
         items = Fields({f"{key}[{n}]": item for n, item in enumerate(value)}, self.file, self.path)
         return torch.stack([items.transform(name) for name in items.content])
 
@@ -86,7 +105,7 @@ class Fields:
         """The existing file under `key`, relative to `folder` unless absolute."""
         value = self.value(key, "the path of a file")
         if not isinstance(value, str):
-            raise InputError(f"{self.where(key)}: the path of a file was expected, found {value!r}.")
+            raise InputError(f"{self.where(key)}: the path of a file was expected, found {_short(value)}.")
         path = folder / value
         if not (path.is_file() or (may_be_folder and path.is_dir())):
             raise InputError(f"{self.where(key)}: there is no file {path}. Paths are relative to {self.file}.")
@@ -99,5 +118,15 @@ class Fields:
         except (TypeError, ValueError, RuntimeError):
             numbers = torch.empty(0)
         if isinstance(value, bool) or numbers.shape != shape or not torch.isfinite(numbers).all():
-            raise InputError(f"{self.where(key)}: {expected} was expected, found {value!r}.")
+            raise InputError(f"{self.where(key)}: {expected} was expected, found {_short(value)}.")
         return numbers
+
+
+def _short(value: Any) -> str:
+    """What was found, in a few characters."""
+    text = (
+        repr(value)
+        if isinstance(value, str | int | float | type(None))
+        else f"{type(value).__name__} {str(value)[:60]}"
+    )
+    return text if len(text) <= 80 else text[:77] + "…"

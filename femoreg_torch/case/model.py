@@ -1,75 +1,101 @@
-"""What one procedure consists of."""
+"""What one procedure consists of: rigid objects, fluoroscopic images, and how each object starts."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import torch
 from torch import Tensor
 
-from femoreg_torch.geometry import CArm
+from femoreg_torch.anatomy import Anatomy, LabelTable
+from femoreg_torch.geometry import CArm, Poses
 
 Side = Literal["left", "right"]
 Intensity = Literal["raw", "log"]  # raw: bone dark, as a detector counts; log: attenuation, bone bright
 
-STRUCTURES = ("pelvis", "femur_left", "femur_right")
-DEVICE_POINTS = ("tip", "base", "center")
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """How an object starts: at a nominal pose, beside another object, or, with neither, where landmarks put it.
+
+    Two structures of one CT have one space, so that beside one another they start where the CT has them.
+    """
+
+    camera1_from: Tensor | None = None  # (4, 4) nominal pose in camera 1
+    beside: str | None = None  # the name of another object
+    beside_from_object: Tensor = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
+
+    @property
+    def by_landmarks(self) -> bool:
+        """Whether landmarks place it."""
+        return self.camera1_from is None and self.beside is None
 
 
 @dataclass(frozen=True)
-class Device:
-    """A drilling or injection device: a closed mesh, a labelled volume, or (where `hu` is None) a volume in HU.
+class Model:
+    """What an object looks like if it is no bone: a closed mesh, a labelled volume, or (`hu` None) a volume in HU."""
 
-    Points (3,) are mm in the device's own space: the mesh's coordinates, or the volume's LPS.
-    """
-
-    model_path: Path
+    path: Path
     hu: float | None  # of its material
-    points: dict[str, Tensor]  # tip, base (guide axis: base → tip) and center (where errors are reported)
-    camera1_from_device: Tensor  # (4, 4), nominal start pose
     labels: tuple[int, ...] | None = None  # of its voxels in a labelled volume
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class CaseObject:
+    """A rigid object. Points (3,) are mm in its own space: LPS of the CT or of its volume, coordinates of its mesh."""
+
+    name: str
+    bones: tuple[str, ...] = ()  # of the CT's label map: names in the case's `bones`, or groups of the anatomy
+    model: Model | None = None  # or a model of its own
+    reference: Tensor | None = None  # (3,) where errors are told and rotations turn about; None: middle of its box
+    points: dict[str, Tensor] = field(default_factory=dict)  # named points
+    images: tuple[str, ...] | None = None  # kinds of images that show it; None: all
+    start: Start = field(default_factory=Start)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedPath:
+    """A path through an object, from the entry point to the target, that the guide of a tool is to follow."""
+
+    object: str
+    entry_point: Tensor  # (3,) in the object's space
+    target: Tensor  # (3,)
+    tool: str | None = None  # the object whose points `base` and `tip` are the guide's
+
+
+@dataclass(frozen=True, eq=False)
 class View:
-    """The images of one C-arm pose."""
+    """The images of one C-arm pose, by kind."""
 
-    anatomy: Path
-    device: Path | None = None
+    images: dict[str, Path]
     intensity: Intensity = "raw"
+    camera_from_camera1: Tensor | None = None  # (4, 4) where the C-arm's pose is known
 
 
-@dataclass(frozen=True)
-class Truth:
-    """Known poses of a simulated procedure; `pelvis` and `femur` are the CT's, LPS mm."""
-
-    camera_from_pelvis: Tensor  # (V, 4, 4)
-    camera1_from_femur: Tensor  # (4, 4)
-    camera1_from_device: Tensor | None = None  # (4, 4)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
-    """One procedure. Points are LPS mm, all tensors float64."""
+    """One procedure. Points are mm, all tensors float64."""
 
     folder: Path
-    side: Side  # operated femur
-    ct_path: Path
-    labels_path: Path | None
-    structures: dict[str, tuple[int, ...]]  # label ids of pelvis, femur_left, femur_right
-    landmarks: dict[str, Tensor]  # (3,) each, in the order of HIP_LANDMARKS
-    entry_point: Tensor  # (3,)
-    target: Tensor  # (3,), where the planned path ends
-    device: Device | None
     carm: CArm
-    views: tuple[View, ...] = field(default=())
-    truth: Truth | None = None
+    objects: dict[str, CaseObject]  # in order; the C-arm's poses are told by where the first one is
+    views: tuple[View, ...] = ()
+    anatomy: Anatomy | None = None  # the body part, where it is a known one
+    ct_path: Path | None = None
+    labels_path: Path | None = None
+    bones: LabelTable = field(default_factory=dict)  # ids in the label map of bones, or of groups of bones
+    landmarks: dict[str, Tensor] = field(default_factory=dict)  # (3,) each, LPS
+    plan: PlannedPath | None = None
+    truth: Poses | None = None
+    template: str | None = None  # what `case.yaml` is a short form of
+    side: Side | None = None  # operated side, where the template has one
 
     @property
-    def femur(self) -> str:
-        """Name of the operated femur's structure."""
-        return f"femur_{self.side}"
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of images that any view has, in order of appearance; landmarks are seen in the first."""
+        return tuple(dict.fromkeys(kind for view in self.views for kind in view.images))
 
     @property
-    def femoral_head(self) -> Tensor:
-        """Centre (3,) of the operated femoral head, LPS mm."""
-        return self.landmarks[f"FH-{self.side[0]}"]
+    def anchor(self) -> str:
+        """The first object: the C-arm's poses are told by where it is."""
+        return next(iter(self.objects))

@@ -7,9 +7,14 @@ from typing import Any
 
 import torch
 import yaml
+from torch import Tensor
 
-from femoreg_torch.case.model import Case, Device, Truth
-from femoreg_torch.case.reading import VERSION
+from femoreg_torch.anatomy import LabelTable, label_table, label_table_names
+from femoreg_torch.case.femoroplasty import DEVICE, Device, device_of, femoral_head
+from femoreg_torch.case.model import Case, CaseObject, Model, PlannedPath, Start, View
+from femoreg_torch.case.parts import ONE_KIND
+from femoreg_torch.case.poses import poses_content
+from femoreg_torch.case.reading import VERSIONS
 from femoreg_torch.configs import preset_names
 from femoreg_torch.files import plain, write_json, write_text
 from femoreg_torch.geometry import CArm, load_carm
@@ -17,37 +22,33 @@ from femoreg_torch.volume import write_landmarks
 
 
 def write_case(folder: Path, case: Case) -> None:
-    """Write `case.yaml` and what it refers to as text; volumes, images and the device's model must stand in place.
+    """Write `case.yaml` and what it refers to as text; volumes, images and models must stand in place.
 
     Paths are written relative to `folder`, which must exist. `case.folder` is not looked at.
     """
     folder = Path(folder).resolve()
-    ct: dict[str, Any] = {"image": _relative(case.ct_path, folder)}
-    if case.labels_path is not None:
-        ct["labels"] = _relative(case.labels_path, folder)
-    if case.structures:
-        ct["structures"] = {name: list(ids) for name, ids in case.structures.items()}
-    at_head = torch.equal(case.target, case.femoral_head)
-    content: dict[str, Any] = {
-        "version": VERSION,
-        "side": case.side,
-        "ct": ct,
-        "landmarks": "landmarks.json",
-        "plan": {"entry_point": case.entry_point, "target": "FH" if at_head else case.target},
-    }
-    if case.device is not None:
-        content["device"] = _device(case.device, folder)
+    content: dict[str, Any] = {"version": VERSIONS[-1]}
+    if case.template is not None:
+        content |= {"template": case.template, "side": case.side}
+    elif case.anatomy is not None:
+        content["anatomy"] = case.anatomy.name
+    if case.ct_path is not None:
+        content["ct"] = _ct(case, folder)
+    if case.landmarks:
+        write_landmarks(folder / "landmarks.json", case.landmarks)
+        content["landmarks"] = "landmarks.json"
+    if case.template is not None:
+        content |= _femoroplasty(case, folder)
+    else:
+        content["objects"] = {name: _object(thing, folder) for name, thing in case.objects.items()}
+        if case.plan is not None:
+            content["plan"] = _plan(case.plan)
     content["carm"] = _carm(case.carm)
     if case.views:
-        content["views"] = [
-            {key: _relative(path, folder) for key, path in (("anatomy", v.anatomy), ("device", v.device)) if path}
-            | {"intensity": v.intensity}
-            for v in case.views
-        ]
+        content["views"] = [_view(view, folder, case.template is not None) for view in case.views]
     if case.truth is not None:
-        write_json(folder / "truth.json", _truth(case.truth))
+        write_json(folder / "truth.json", poses_content(case.truth, case.anchor))
         content["truth"] = "truth.json"
-    write_landmarks(folder / "landmarks.json", case.landmarks)
     text = yaml.safe_dump(plain(content), sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
     write_text(folder / "case.yaml", text)
 
@@ -56,18 +57,79 @@ def _relative(path: Path, folder: Path) -> str:
     return Path(os.path.relpath(Path(path).resolve(), folder)).as_posix()
 
 
+def _ct(case: Case, folder: Path) -> dict[str, Any]:
+    assert case.ct_path is not None  # seen by the caller
+    ct: dict[str, Any] = {"image": _relative(case.ct_path, folder)}
+    if case.labels_path is not None:
+        ct["labels"] = _relative(case.labels_path, folder)
+        ct["bones"] = _bones(case.bones)
+    return ct
+
+
+def _bones(bones: LabelTable) -> str | dict[str, int | list[int]]:
+    """The name of the table that equals `bones`, or all its ids."""
+    for name in label_table_names():
+        if label_table(name) == bones:
+            return name
+    return {bone: ids[0] if len(ids) == 1 else list(ids) for bone, ids in bones.items()}
+
+
+def _femoroplasty(case: Case, folder: Path) -> dict[str, Any]:
+    assert case.plan is not None  # the template has both
+    assert case.side is not None
+    at_head = torch.equal(case.plan.target, case.landmarks[femoral_head(case.side)])
+    target: str | Tensor = femoral_head(case.side).rpartition("-")[0] if at_head else case.plan.target
+    content: dict[str, Any] = {"plan": {"entry_point": case.plan.entry_point, "target": target}}
+    if (device := device_of(case)) is not None:
+        content[DEVICE] = _device(device, folder)
+    return content
+
+
 def _device(device: Device, folder: Path) -> dict[str, Any]:
-    content: dict[str, Any] = {}
-    is_volume = device.labels is not None or device.hu is None
-    content["volume" if is_volume else "model"] = _relative(device.model_path, folder)
-    if device.labels is not None:
-        content["labels"] = list(device.labels)
-    if device.hu is not None:
-        content["hu"] = device.hu
-    return content | {
-        "points": device.points,
-        "camera1_from_device": device.camera1_from_device,
-    }
+    pose = {f"camera1_from_{DEVICE}": device.camera1_from_device}
+    return _model(device.model, folder) | {"points": device.points} | pose
+
+
+def _model(model: Model, folder: Path) -> dict[str, Any]:
+    is_volume = model.labels is not None or model.hu is None
+    content: dict[str, Any] = {"volume" if is_volume else "model": _relative(model.path, folder)}
+    if model.labels is not None:
+        content["labels"] = list(model.labels)
+    if model.hu is not None:
+        content["hu"] = model.hu
+    return content
+
+
+def _object(thing: CaseObject, folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = {"bones": list(thing.bones)} if thing.model is None else _model(thing.model, folder)
+    if thing.points:
+        content["points"] = thing.points
+    if thing.reference is not None:
+        content["reference"] = thing.reference
+    if thing.images is not None:
+        content["images"] = list(thing.images)
+    return content | {"start": _start(thing.start)}
+
+
+def _start(start: Start) -> Any:
+    if start.by_landmarks:
+        return "landmarks"
+    if start.camera1_from is not None:
+        return {"camera1_from": start.camera1_from}
+    moved = not torch.equal(start.beside_from_object, torch.eye(4, dtype=torch.float64))
+    return {"beside": start.beside} | ({"beside_from_object": start.beside_from_object} if moved else {})
+
+
+def _plan(plan: PlannedPath) -> dict[str, Any]:
+    tool = {} if plan.tool is None else {"tool": plan.tool}
+    return {"object": plan.object, "entry_point": plan.entry_point, "target": plan.target} | tool
+
+
+def _view(view: View, folder: Path, short: bool) -> dict[str, Any]:
+    images = {kind: _relative(path, folder) for kind, path in view.images.items()}
+    content: dict[str, Any] = images if short or list(images) == [ONE_KIND] else {"images": images}
+    pose = {} if view.camera_from_camera1 is None else {"camera_from_camera1": view.camera_from_camera1}
+    return content | {"intensity": view.intensity} | pose
 
 
 def _carm(carm: CArm) -> str | dict[str, Any]:
@@ -76,7 +138,3 @@ def _carm(carm: CArm) -> str | dict[str, Any]:
         if load_carm(name) == carm:
             return name
     return asdict(carm.camera) | {"isocentre_mm": carm.isocentre_mm, "orbit_axis": carm.orbit_axis}
-
-
-def _truth(truth: Truth) -> dict[str, Any]:
-    return {name: poses for name, poses in asdict(truth).items() if poses is not None}

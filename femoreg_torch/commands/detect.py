@@ -22,7 +22,7 @@ def detect(
     Args:
         images: fluoroscopic images, or folders of nothing else: DICOM, PNG, TIFF, NIfTI, MHA or NRRD.
         out: folder of the results.
-        carm: C-arm preset that the images come from.
+        carm: C-arm that the images come from: a preset, or a YAML file such as configs/carm/cios_fusion.yaml.
         intensity: raw (bone dark) or log (attenuation, bone bright).
         weights: network weights (safetensors); by default the shipped ones.
     """

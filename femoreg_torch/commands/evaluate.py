@@ -13,15 +13,18 @@ def evaluate(case: Path, run: Path) -> None:
         run: Folder that `femoreg register` wrote; the files are added to it.
     """
     from rich.console import Console
+    from rich.markup import escape
 
     from femoreg_torch.case import read_case, read_result
-    from femoreg_torch.evaluation import error_tables, evaluate_run
+    from femoreg_torch.commands.telling import tell_verdict
+    from femoreg_torch.evaluation import error_tables, write_report
 
-    console = Console()
-    errors = evaluate_run(read_case(case), read_result(run), run)
+    console, result = Console(), read_result(run)
+    errors = write_report(read_case(case), result, run)
     if errors is None:
-        console.print(f"{case} holds no truth, so there are no errors to tell.")
+        console.print(f"{escape(str(case))} holds no truth, so there are no errors to tell.")
     else:
         for table in error_tables(errors):
             console.print(table)
-    console.print(f"Report: {run / 'report.html'}")
+    tell_verdict(console, result)
+    console.print(f"Report: {escape(str(run / 'report.html'))}")

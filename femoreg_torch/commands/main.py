@@ -17,17 +17,18 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import femoreg_torch
+from femoreg_torch.commands.status import BAD_INPUT, DONE, INTERRUPTED
 from femoreg_torch.errors import InputError
+from femoreg_torch.extras import missing_extra
 
 GROUP = "femoreg_torch.commands"
-_BAD_INPUT, _INTERRUPTED = 2, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `femoreg` with these arguments (those of the process if None) and return its exit status.
 
-    0: done; 2: bad input, told in one line on stderr; 130: interrupted. Whatever else goes wrong is a defect of this
-    program and keeps its traceback.
+    0: done; 2: bad input, told in one line on stderr; 3: done, but not trusted; 130: interrupted. Whatever
+    else goes wrong is a defect of this program and keeps its traceback.
     """
     # Threads that wait actively for one another cost ten times the processor time where others use the machine too.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -39,24 +40,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         elif arguments[0] == "--version":
             print(f"femoreg {femoreg_torch.__version__}")
         elif arguments[0] in commands:
-            _run(commands[arguments[0]], arguments[1:])
+            return _run(commands[arguments[0]], arguments[1:])
         else:
             raise InputError(f"no command {arguments[0]!r}; there are: {', '.join(commands)}.")
     except InputError as error:
         return _complain(str(error))
+    except ModuleNotFoundError as error:
+        advice = missing_extra(error)
+        if advice is None:
+            raise
+        return _complain(advice)
     except OSError as error:
         if error.filename is None:
             raise
         return _complain(f"{error.filename}: {error.strerror}.")
     except KeyboardInterrupt:
         _complain("interrupted.")
-        return _INTERRUPTED
-    return 0
+        return INTERRUPTED
+    return DONE
 
 
 def _complain(message: str) -> int:
     print(f"femoreg: {' '.join(message.split())}", file=sys.stderr)
-    return _BAD_INPUT
+    return BAD_INPUT
 
 
 def _overview(commands: dict[str, EntryPoint]) -> str:
@@ -91,9 +97,10 @@ def _summary(command: EntryPoint) -> str:
     return "(not installed here)"
 
 
-def _run(command: EntryPoint, arguments: list[str]) -> None:
+def _run(command: EntryPoint, arguments: list[str]) -> int:
     function = command.load()
-    function(**_parse(function, command.name, arguments))
+    status = function(**_parse(function, command.name, arguments))
+    return DONE if status is None else int(status)
 
 
 def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dict[str, Any]:

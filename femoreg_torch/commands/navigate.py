@@ -4,7 +4,7 @@ from pathlib import Path
 
 
 def navigate(run: Path, *, robot: Path | None = None) -> None:
-    """Tell how far the guide is from the planned path, and write the motion of the device that corrects it.
+    """Tell how far the guide is from the planned path, and write the motion of the tool that corrects it.
 
     Writes into RUN: navigation.json, and navigation/ with every transform as 4×4 text (.txt) and as an ITK transform
     (.tfm) for 3D Slicer and SimpleITK. A matrix `b_from_a` takes points of frame a to frame b, in mm. A .tfm is in
@@ -22,15 +22,23 @@ def navigate(run: Path, *, robot: Path | None = None) -> None:
 
     from femoreg_torch.case import new_folder, read_result
     from femoreg_torch.errors import InputError
-    from femoreg_torch.navigation import NAVIGATION_NAME, navigation_content, read_robot, summary, write_navigation
+    from femoreg_torch.navigation import (
+        NAVIGATION_NAME,
+        NAVIGATION_NAMES,
+        navigation_content,
+        read_robot,
+        summary,
+        write_navigation,
+    )
 
-    calibration = None if robot is None else read_robot(robot)
     result = read_result(run)
+    tool = (result.path and result.path[1]) or "device"
+    calibration = None if robot is None else read_robot(robot, tool)
     try:
         content = navigation_content(result, calibration)
     except InputError as error:
         raise InputError(f"{run}: {error}") from error
-    with new_folder(run) as folder:
+    with new_folder(run, without=NAVIGATION_NAMES) as folder:
         write_navigation(folder, content)
     console = Console()
     for line in summary(content):

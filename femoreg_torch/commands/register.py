@@ -1,6 +1,10 @@
 """`femoreg register`: from a case folder to poses."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from femoreg_torch.case import Case
 
 
 def register(
@@ -10,60 +14,80 @@ def register(
     preset: str = "fast",
     seed: int = 0,
     weights: Path | None = None,
+    landmarks: Path | None = None,
+    start: Path | None = None,
     robot: Path | None = None,
-) -> None:
-    """Register femur and device to the fluoroscopic images of a case.
+    require_trust: bool = False,
+) -> int:
+    """Register the objects of a case, such as femur and device, to its fluoroscopic images.
 
-    Landmarks found by the network in view 1 start the pelvis; the steps of the preset do the rest. Writes result.json
-    with all poses, their quality and, where the case has a truth, their errors; and where a device was registered, the
-    motion that brings its guide onto the planned path: navigation.json and navigation/, see `femoreg navigate --help`.
-    `femoreg evaluate` makes pictures of the result, `femoreg replay` shows how it came about.
+    Landmarks found by the network in view 1 start the bones; the steps of the preset do the rest. Writes result.json
+    with all poses, their quality and, where the case has a truth, their errors; and where a tool with a guide was
+    registered, the motion that brings it onto the planned path: navigation.json and navigation/, see `femoreg navigate
+    --help`. `femoreg evaluate` makes pictures of the result, `femoreg replay` shows how it came about.
 
     Args:
         case: Case folder with case.yaml.
-        out: Folder to write the result to.
-        preset: Workflow in configs/registration: `fast` (derivatives of the images, everything refined together),
-            `paper` (images and optimisers of the paper, minutes) or `derivative_free` (as `paper`, but coarse).
+        out: Folder to write the result to. What an earlier run wrote there is replaced as a whole.
+        preset: Workflow in configs/registration, or a YAML file: `fast` (derivatives of the images, everything refined
+            together), `paper` (images and optimisers of the paper, minutes), `derivative_free` (as `paper`, but coarse)
+            or `rigid` (any rigid objects).
         seed: Of the random searches; the same seed gives the same result.
         weights: Weights of the landmark network, if not those shipped (safetensors).
+        landmarks: Landmarks in the first image, picked by hand or found by another network, in place of the network's:
+            a CSV file with the columns landmark, column_px, row_px (as `femoreg detect` writes it), or 3D Slicer
+            markups with x = column and y = row.
+        start: Start poses in place of landmarks and of nominal poses: a JSON file with an entry
+            `camera1_from_<object>`, 4×4 in mm, for each object that is to start there, such as an earlier result.json.
         robot: Calibration of the robot, to have the motion in its base frame too: see `femoreg navigate --help`.
+        require_trust: End with status 3 if the result is not trusted.
     """
     import os
+    from dataclasses import replace
 
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.markup import escape
 
-    from femoreg_torch.case import RESULT_NAME, new_folder, read_case, write_json
+    from femoreg_torch.case import RESULT_NAME, new_folder, read_case, result_content, write_json
+    from femoreg_torch.case.start_files import read_pixels, read_start_poses
+    from femoreg_torch.commands.status import NOT_TRUSTED
+    from femoreg_torch.commands.telling import progress_report, tell_verdict
     from femoreg_torch.errors import InputError
-    from femoreg_torch.evaluation import errors, poses_of, reference_points
-    from femoreg_torch.navigation import clear_navigation, navigation_content, read_robot, summary, write_navigation
-    from femoreg_torch.registration.run import register_case
+    from femoreg_torch.evaluation import EVALUATION_NAMES, evaluate
+    from femoreg_torch.navigation import NAVIGATION_NAMES, navigation_content, read_robot, summary, write_navigation
+    from femoreg_torch.registration.run import network_detector, register_scene
 
     console, procedure = Console(), read_case(case)
-    calibration = None if robot is None else read_robot(robot)
-    if robot is not None and (procedure.device is None or any(view.device is None for view in procedure.views)):
-        raise InputError(f"{case}: --robot was given, but there is no device to steer, or a view has no image of it.")
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("reading the case", total=1.0)
-
-        def report(step: str, share: float) -> None:
-            progress.update(task, completed=share, description=step)
-
-        content = register_case(procedure, preset, seed, weights, report)
-    if procedure.truth is not None:
-        content["errors"] = errors(procedure.truth, poses_of(content), reference_points(procedure))
-    content["case"] = os.path.relpath(case.resolve(), out.resolve())
-    navigation = navigation_content(content, calibration) if "camera1_from_device" in content else None
-    with new_folder(out) as folder:
-        write_json(folder / RESULT_NAME, content)
-        if navigation is None:
-            clear_navigation(out)
-        else:
+    tool = None if procedure.plan is None else procedure.plan.tool
+    calibration = None if robot is None or tool is None else read_robot(robot, tool)
+    if robot is not None and (tool is None or not _is_seen(procedure, tool)):
+        raise InputError(f"{case}: --robot was given, but there is no tool to steer, or a view has no image of it.")
+    with progress_report(console, "reading the case") as report:
+        result, scene = register_scene(
+            procedure,
+            None,
+            preset,
+            seed=seed,
+            find=None if weights is None else network_detector(procedure, weights),
+            landmarks=None if landmarks is None else read_pixels(landmarks),
+            start=None if start is None else read_start_poses(start),
+            report=report,
+        )
+    result = replace(
+        result, errors=evaluate(procedure, result, scene), case=os.path.relpath(case.resolve(), out.resolve())
+    )
+    navigation = None if result.object_from_tool is None else navigation_content(result, calibration)
+    with new_folder(out, without=(*EVALUATION_NAMES, *NAVIGATION_NAMES, "replay.gif")) as folder:
+        write_json(folder / RESULT_NAME, result_content(result))
+        if navigation is not None:
             write_navigation(folder, navigation)
-    for name, quality in content["quality"].items():
-        if not quality["trusted"]:
-            console.print(f"[bold red]Do not trust the pose of the {name}[/]: {quality['reason']}.")
+    tell_verdict(console, result)
     for line in [] if navigation is None else summary(navigation):
         console.print(line)
-    console.print(f"Result written to {out / 'result.json'} ({content['timings_s']['total']:.0f} s).")
+    console.print(f"Result written to {escape(str(out / RESULT_NAME))} ({result.timings_s['total']:.0f} s).")
+    return NOT_TRUSTED if require_trust and not result.verdict.trusted else 0
+
+
+def _is_seen(case: "Case", tool: str) -> bool:
+    kinds = case.objects[tool].images or case.kinds
+    return any(all(kind in view.images for view in case.views) for kind in kinds)

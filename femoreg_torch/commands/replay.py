@@ -6,8 +6,8 @@ from pathlib import Path
 def replay(run: Path, *, case: Path | None = None, out: Path | None = None) -> None:
     """Show how a registration converged: an animated picture of the overlay, stage after stage.
 
-    Each frame has the edges of pelvis, femur and device, rendered at the poses of that moment, in green over the
-    fluoroscopic images; views and structures that have no place yet stay dark and bare. Above stand the stage, its
+    Each frame has the edges of all objects, rendered at the poses of that moment, in green over the
+    fluoroscopic images; views and objects that have no place yet stay dark and bare. Above stand the stage, its
     evaluations so far and its cost (what it minimises: mean dissimilarity of its images, and its prior); in each
     image the similarity (mean patch Grad-NCC, 1 at most) of all that is drawn, by the same measure in all stages.
 
@@ -24,9 +24,9 @@ def replay(run: Path, *, case: Path | None = None, out: Path | None = None) -> N
 
     console, result = Console(), read_result(run)
     if case is None:
-        if "case" not in result:
+        if result.case is None:
             raise InputError(f"{run / RESULT_NAME}, case: missing. Name the case folder with --case.")
-        case = run / result["case"]
+        case = run / result.case
         if not case.is_dir():
             raise InputError(f"{case}: no such folder. Name the case folder with --case.")
     path = run / "replay.gif" if out is None else out

@@ -2,14 +2,13 @@
 
 from femoreg_torch.detect.decode import decode_heatmaps
 from femoreg_torch.detect.grid import image_from_network, network_camera, to_network_grid
-from femoreg_torch.detect.looks import MIRRORED_LABELS, MIRRORED_LANDMARKS
-from femoreg_torch.detect.network import Detection, detect, load_network
+from femoreg_torch.detect.network import Detection, detect
 from femoreg_torch.detect.normalise import normalise
+from femoreg_torch.detect.weights import LandmarkNetwork, load_network
 
 __all__ = [
-    "MIRRORED_LABELS",
-    "MIRRORED_LANDMARKS",
     "Detection",
+    "LandmarkNetwork",
     "decode_heatmaps",
     "detect",
     "image_from_network",

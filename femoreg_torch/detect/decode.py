@@ -4,10 +4,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-_RADIUS = 4  # pixels of the heat map; 2.7 standard deviations of the peak that the network is trained to show
+_RADIUS = 4  # pixels of the heat map (12.4 mm on the detector)
 _NEAR = 8.0  # pixels about a landmark that its expected error is read from
-_PEAK_PX = 1.25  # standard deviation of the target that the shipped weights were trained on
-_GAIN, _FLOOR_PX = 0.40, 0.36
+_GAIN, _FLOOR_PX = 0.40, 0.36  # fitted on the patient that validated the training of the shipped weights
 
 
 def decode_heatmaps(heatmaps: Tensor, absence: Tensor) -> tuple[Tensor, Tensor]:
@@ -33,11 +32,11 @@ def decode_heatmaps(heatmaps: Tensor, absence: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([column + along, row + down], 1), mass
 
 
-def expected_error(heatmaps: Tensor, positions: Tensor) -> Tensor:
+def expected_error(heatmaps: Tensor, positions: Tensor, sigma_px: float) -> Tensor:
     """Standard deviation (L,) along each axis, in pixels of the heat map, to expect of `positions` (L, 2).
 
-    From the variance of the distribution within 8 pixels, less that of the peak which the network is trained to show:
-    σ² = gain · (variance − peak²) + floor², with gain and floor fitted on the patient that validated the training.
+    From the variance of the distribution within 8 pixels, less that of the peak of `sigma_px` which the network was
+    trained to show: σ² = gain · (variance − sigma_px²) + floor².
     """
     rows, columns = (torch.arange(n, dtype=torch.float64) for n in heatmaps.shape[1:])
     along, down = columns - positions[:, :1], rows - positions[:, 1:]
@@ -45,4 +44,4 @@ def expected_error(heatmaps: Tensor, positions: Tensor) -> Tensor:
     logits = heatmaps.to(torch.float64).masked_fill(~near, -torch.inf)
     share = logits.flatten(1).softmax(1).view(heatmaps.shape)
     variance = 0.5 * ((share.sum(1) * along**2).sum(1) + (share.sum(2) * down**2).sum(1))
-    return (_GAIN * (variance - _PEAK_PX**2).clamp_min(0) + _FLOOR_PX**2).sqrt()
+    return (_GAIN * (variance - sigma_px**2).clamp_min(0) + _FLOOR_PX**2).sqrt()

@@ -1,4 +1,4 @@
-"""The grid that the network sees: 192 × 192 pixels of 1.552 mm, the paper's detector averaged over 8 × 8 blocks.
+"""The grid that networks are given: 192 × 192 pixels of 1.552 mm, the paper's detector averaged over 8 × 8 blocks.
 
 It lies centred on the image, whatever size and pixels that has: a larger image is cropped, a smaller one padded.
 """

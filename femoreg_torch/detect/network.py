@@ -1,63 +1,60 @@
 """Running the network on one image of any camera."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from femoreg_torch.anatomy import HIP, Anatomy
 from femoreg_torch.detect.decode import decode_heatmaps, expected_error
 from femoreg_torch.detect.grid import image_from_network, network_camera, to_network_grid
-from femoreg_torch.detect.looks import LOOKS, PLAIN, Look, read_image
 from femoreg_torch.detect.normalise import normalise
+from femoreg_torch.detect.tta import AUGMENTATIONS, PLAIN, Augmentation, predict
+from femoreg_torch.detect.weights import LandmarkNetwork
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera
 
 VISIBLE = 0.5  # confidence from which a landmark counts as seen; the confidences are calibrated, see the model card
-_MARGIN = 0.5  # landmarks that a turned or inverted reading must promise beyond the plain one
+_MARGIN = 0.5  # landmarks by which a turned or inverted reading must exceed the plain one
 
 
 @dataclass(frozen=True)
 class Detection:
-    """What the network sees in an image. Landmarks are in the order of `HIP_LANDMARKS`."""
+    """What the network sees in an image: L landmarks and C classes, in the order of its anatomy."""
 
-    pixels: Tensor  # (14, 2) float64 column, row in the image that was given
-    confidence: Tensor  # (14,) float64 probability of the landmark being there
-    deviation_px: Tensor  # (14,) float64 standard deviation to expect of `pixels` along each axis
-    visible: Tensor  # (14,) bool
-    segmentation: Tensor  # (7, h, w) probabilities of background and bones 1 to 6
+    pixels: Tensor  # (L, 2) float64 column, row in the image that was given
+    confidence: Tensor  # (L,) float64 probability of the landmark being there
+    deviation_px: Tensor  # (L,) float64 standard deviation to expect of `pixels` along each axis
+    visible: Tensor  # (L,) bool
+    segmentation: Tensor  # (C, h, w) probabilities of the background and the bones
     network_camera: Camera  # of the segmentation's grid
     turned: bool  # the image was found to stand on its head; all results are for the image as it was given
     inverted: bool = False  # the image was found to have bone dark where attenuation has it bright
+    anatomy: Anatomy = HIP  # what the landmarks and the classes are
 
 
-def load_network(path: Path | None = None) -> nn.Module:
-    """The network of a weights file in evaluation mode; without a path, the shipped one. Raises `InputError`."""
-    from models.weights import load_weights
-
-    try:
-        return load_weights(path)
-    except (OSError, ValueError) as error:
-        raise InputError(str(error)) from error
-
-
-def detect(network: nn.Module, attenuation: Tensor, camera: Camera, looks: tuple[Look, ...] = LOOKS) -> Detection:
+def detect(
+    network: LandmarkNetwork,
+    attenuation: Tensor,
+    camera: Camera,
+    augmentations: tuple[Augmentation, ...] = AUGMENTATIONS,
+) -> Detection:
     """Landmarks and bones in an `attenuation` image (H, W) of `camera`: bone bright, patient left on the right.
 
-    The image is looked at as it is, turned by 180°, and both again with its grey values inverted. The reading that
-    promises the most landmarks wins, as it is unless another promises half a landmark more; several `looks` then refine
-    it. Raises `InputError` for an image that does
-    not fit the camera, holds values that are not finite, or is constant.
+    The image is read as it is, turned by 180°, and both again with its grey values inverted. The plain reading is kept
+    unless another one expects more landmarks by at least half a landmark. What is kept is then read again with
+    test-time augmentation. Raises `InputError` for an image that does not fit the camera, holds values that are not
+    finite, or is constant.
     """
     _check(attenuation, camera)
     image = normalise(to_network_grid(attenuation.to(torch.float32), camera))
     candidates = {(turned, inverted): _oriented(image, turned, inverted) for inverted in (0, 1) for turned in (0, 1)}
-    sure = {key: _confidence(network, candidate) for key, candidate in candidates.items()}
-    turned, inverted = max(sure, key=lambda key: sure[key] - _MARGIN * any(key))
-    reading = read_image(network, candidates[turned, inverted], looks)
-    positions, confidence = decode_heatmaps(reading.heatmaps, reading.absence)
-    deviation = expected_error(reading.heatmaps, positions)
-    segmentation = reading.segmentation.softmax(0)
+    expected = {key: _expected_landmarks(network, candidate) for key, candidate in candidates.items()}
+    turned, inverted = max(expected, key=lambda key: expected[key] - _MARGIN * any(key))
+    prediction = predict(network, candidates[turned, inverted], augmentations)
+    positions, confidence = decode_heatmaps(prediction.heatmaps, prediction.absence)
+    deviation = expected_error(prediction.heatmaps, positions, network.sigma_px)
+    segmentation = prediction.segmentation.softmax(0)
     if turned:
         last = torch.tensor(segmentation.shape[:0:-1], dtype=torch.float64) - 1
         positions, segmentation = last - positions, segmentation.rot90(2, (1, 2))
@@ -75,6 +72,7 @@ def detect(network: nn.Module, attenuation: Tensor, camera: Camera, looks: tuple
         grid.downsampled(factor),
         bool(turned),
         bool(inverted),
+        network.anatomy,
     )
 
 
@@ -83,10 +81,10 @@ def _oriented(image: Tensor, turned: int, inverted: int) -> Tensor:
     return -image if inverted else image
 
 
-def _confidence(network: nn.Module, image: Tensor) -> float:
-    """The number of landmarks to expect in a normalised image on the network's grid, by one look."""
-    reading = read_image(network, image, PLAIN)
-    return decode_heatmaps(reading.heatmaps, reading.absence)[1].sum().item()
+def _expected_landmarks(network: LandmarkNetwork, image: Tensor) -> float:
+    """The number of landmarks to expect in a normalised image on the network's grid, without augmentation."""
+    prediction = predict(network, image, PLAIN)
+    return decode_heatmaps(prediction.heatmaps, prediction.absence)[1].sum().item()
 
 
 def _check(image: Tensor, camera: Camera) -> None:

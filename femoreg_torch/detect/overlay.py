@@ -6,20 +6,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from femoreg_torch.anatomy import Anatomy
 from femoreg_torch.detect.network import Detection
 from femoreg_torch.geometry import Camera
-from femoreg_torch.volume import HIP_LANDMARKS
 
 _WIDTH = 768  # pixels of the picture
-_BONE_COLOURS = np.array(  # RGB of background, hip bones, vertebrae, sacrum, femora
-    [[0, 0, 0], [255, 120, 60], [60, 160, 255], [230, 220, 60], [180, 90, 220], [255, 60, 100], [60, 220, 160]],
-    dtype=np.float32,
-)
-_SIDE_COLOURS = {"l": (255, 70, 70), "r": (70, 220, 255)}
+
+
+def class_colours(anatomy: Anatomy) -> NDArray[np.float32]:
+    """RGB (C, 3) of the classes of a segmentation: black for the background, then the bones."""
+    return np.array([(0, 0, 0), *(bone.colour for bone in anatomy.bones)], dtype=np.float32)
 
 
 def draw_overlay(attenuation: Tensor, detection: Detection, camera: Camera) -> NDArray[np.uint8]:
-    """RGB picture (h, 768, 3): image (H, W) in grey, bones tinted, visible landmarks named, left red and right blue."""
+    """RGB picture (h, 768, 3): image (H, W) in grey, bones tinted, visible landmarks named in their bones' colours."""
     zoom = _WIDTH / attenuation.shape[1]
     size = (_WIDTH, round(attenuation.shape[0] * zoom))
     low, high = (torch.quantile(attenuation.flatten()[::7].float(), q).item() for q in (0.005, 0.995))
@@ -27,18 +27,19 @@ def draw_overlay(attenuation: Tensor, detection: Detection, camera: Camera) -> N
     picture = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)[..., None].repeat(3, 2)
     labels = _labels_on_picture(detection, camera, zoom, size)
     tint = np.where(labels[..., None] > 0, 0.25, 0.0)
-    picture = ((1 - tint) * picture + tint * _BONE_COLOURS[labels]).astype(np.uint8)
-    for name, pixel, visible in zip(HIP_LANDMARKS, detection.pixels, detection.visible, strict=True):
+    picture = ((1 - tint) * picture + tint * class_colours(detection.anatomy)[labels]).astype(np.uint8)
+    for landmark, pixel, visible in zip(detection.anatomy.landmarks, detection.pixels, detection.visible, strict=True):
         if visible:
             column, row = (round(v) for v in ((pixel + 0.5) * zoom - 0.5).tolist())
-            colour = _SIDE_COLOURS[name[-1]]
+            colour = detection.anatomy.bone(landmark.bone).colour
             cv2.circle(picture, (column, row), 4, colour, 1, cv2.LINE_AA)
-            cv2.putText(picture, name, (column + 6, row - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+            place = (column + 6, row - 4)
+            cv2.putText(picture, landmark.name, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
     return np.asarray(picture, dtype=np.uint8)
 
 
 def _labels_on_picture(detection: Detection, camera: Camera, zoom: float, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """The most probable label of each pixel of the picture, 0 outside of the network's grid."""
+    """The most probable class of each pixel (h, w) of the picture, 0 outside of the network's grid."""
     grid = detection.network_camera
     # Both images lie on one detector: mm from the principal point, column and row, agree.
     affine = np.zeros((2, 3))

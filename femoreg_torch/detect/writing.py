@@ -12,7 +12,7 @@ from femoreg_torch.detect.network import Detection
 from femoreg_torch.detect.overlay import draw_overlay
 from femoreg_torch.files import new_folder
 from femoreg_torch.geometry import Camera
-from femoreg_torch.volume import HIP_LANDMARKS, write_landmarks
+from femoreg_torch.volume import write_landmarks
 
 COLUMNS = ("image", "landmark", "column_px", "row_px", "confidence", "visible")
 
@@ -34,9 +34,8 @@ def write_detections(
 
 
 def _rows(path: Path, detection: Detection) -> list[list[object]]:
-    values = zip(
-        HIP_LANDMARKS, detection.pixels.tolist(), detection.confidence.tolist(), detection.visible, strict=True
-    )
+    names = detection.anatomy.landmark_names
+    values = zip(names, detection.pixels.tolist(), detection.confidence.tolist(), detection.visible, strict=True)
     return [
         [path, name, f"{column:.2f}", f"{row:.2f}", f"{confidence:.4f}", int(visible)]
         for name, (column, row), confidence, visible in values
@@ -45,5 +44,5 @@ def _rows(path: Path, detection: Detection) -> list[list[object]]:
 
 def _in_image_plane(detection: Detection) -> dict[str, Tensor]:
     """Visible landmarks as points (column, row, 0)."""
-    seen = zip(HIP_LANDMARKS, detection.pixels, detection.visible, strict=True)
+    seen = zip(detection.anatomy.landmark_names, detection.pixels, detection.visible, strict=True)
     return {name: torch.cat([pixel, pixel.new_zeros(1)]) for name, pixel, visible in seen if visible}

@@ -13,89 +13,85 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from femoreg_torch.case import Case, Truth
+from femoreg_torch.case import Case, PlannedPath
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import euler_xyz_deg, invert_rigid, rotation_angle, transform_points
-from femoreg_torch.volume import read_ct, read_labels
+from femoreg_torch.geometry import Poses, euler_xyz_deg, invert_rigid, rotation_angle, transform_points
+from femoreg_torch.registration.prepare import read_bones, reference_point
+from femoreg_torch.registration.scene import Scene
 
 PAPER_FROM_CAMERA = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ReferencePoints:
-    """The points (3,) in mm at which errors are told: LPS for bone, CAD for the device."""
+    """Where errors are told, mm in the space of each object."""
 
-    pelvis: Tensor  # middle of the pelvis
-    femoral_head: Tensor
-    entry_point: Tensor
-    target: Tensor
-    device: dict[str, Tensor] | None = None  # its tip, base and center
+    objects: dict[str, Tensor]  # (3,) of every object
+    plan: PlannedPath | None = None
+    guide: tuple[Tensor, Tensor] | None = None  # base and tip (3,) of the plan's tool
 
 
-def reference_points(case: Case) -> ReferencePoints:
-    """Reference points of a case; that of the pelvis is the middle of its labels' bounding box.
+def reference_points(case: Case, scene: Scene | None = None) -> ReferencePoints:
+    """Reference points of a case; that of bones without one of their own is the middle of their labels' bounding box.
 
-    Reads the label map; raises `InputError` if there is none, or none of the pelvis in it.
+    They are taken from the `scene` of the case, if it is there; else the label map is read where one is needed. Raises
+    `InputError` if there is none, or none of the bones in it.
     """
-    if case.labels_path is None:
-        raise InputError(f"{case.folder}: has no label map to find the middle of the pelvis. Add `ct.labels`.")
-    labels = read_labels(case.labels_path, read_ct(case.ct_path))
-    ids = torch.tensor(case.structures["pelvis"], dtype=labels.data.dtype)
-    found = torch.isin(labels.data, ids).nonzero()
-    if len(found) == 0:
-        raise InputError(f"{case.labels_path}: no voxel carries a label of the pelvis ({ids.tolist()}).")
-    middle = (found.amin(0) + found.amax(0)).flip(0).to(torch.float64) / 2
-    pelvis = transform_points(labels.lps_from_index, middle[None])[0]
-    return ReferencePoints(
-        pelvis=pelvis,
-        femoral_head=case.femoral_head,
-        entry_point=case.entry_point,
-        target=case.target,
-        device=case.device.points if case.device else None,
-    )
+    if scene is not None:
+        objects = {name: thing.reference_point for name, thing in scene.objects.items()}
+    else:
+        boxed = any(thing.model is None and thing.reference is None for thing in case.objects.values())
+        bones = read_bones(case)[1] if boxed else None
+        objects = {name: reference_point(case, name, bones) for name in case.objects}
+    guide = None
+    if case.plan is not None and case.plan.tool is not None:
+        points = case.objects[case.plan.tool].points
+        guide = points["base"], points["tip"]
+    return ReferencePoints(objects, case.plan, guide)
 
 
-def errors(truth: Truth, estimate: Truth, points: ReferencePoints) -> dict[str, Any]:
+def errors(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, Any]:
     """Errors of an estimate, the rows of the paper's Tables I and II.
 
-    `pelvis`, `femur`, `device` (equations 5 and 6), `view2`, `view3`, … (7 and 8): `{mm, deg, mm_xyz, deg_xyz}` with
-    the displacement of the reference point (of a view: of its source) and the axis angle, and signed along IS, LR, AP,
-    the rotation as xyz Euler angles. `entry_point_mm` (9), `tip_mm` (10), `relative_mm` (11), `path_deg` (12),
-    `guide_deg` (13). What needs the device is left out where truth or estimate has none. Raises `InputError` if the
-    numbers of views differ.
+    A row for every object that both place (equations 5 and 6), and `view2`, `view3`, … (7 and 8): `{mm, deg, mm_xyz,
+    deg_xyz}` with the displacement of the reference point (of a view: of its source) and the axis angle, and signed
+    along IS, LR, AP, the rotation as xyz Euler angles. Of a planned path: `entry_point_mm` (9), `tip_mm` (10),
+    `relative_mm` (11), `path_deg` (12), `guide_deg` (13); what needs a tool is left out where truth or estimate has
+    none. Raises `InputError` if the numbers of views differ.
     """
-    if len(truth.camera_from_pelvis) != len(estimate.camera_from_pelvis):
+    counts = len(truth.camera_from_camera1), len(estimate.camera_from_camera1)
+    if counts[0] != counts[1]:
         raise InputError(
-            f"errors: the truth has {len(truth.camera_from_pelvis)} views, the estimate "
-            f"{len(estimate.camera_from_pelvis)}. Are they of the same case?"
+            f"errors: the truth has {counts[0]} views, the estimate {counts[1]}. Are they of the same case?"
         )
-    rows: dict[str, Any] = {
-        "pelvis": _row(truth.camera_from_pelvis[0], estimate.camera_from_pelvis[0], points.pelvis),
-        "femur": _row(truth.camera1_from_femur, estimate.camera1_from_femur, points.femoral_head),
-    }
-    entry = _displacement(truth.camera1_from_femur, estimate.camera1_from_femur, points.entry_point)
-    path = points.target - points.entry_point
+    there, here = truth.camera1_from, estimate.camera1_from
+    rows: dict[str, Any] = {name: _row(there[name], here[name], points.objects[name]) for name in there if name in here}
+    source = torch.zeros(3, dtype=torch.float64)
+    cameras = zip(truth.camera_from_camera1[1:], estimate.camera_from_camera1[1:], strict=True)
+    for number, (true_camera, camera) in enumerate(cameras, 2):
+        rows[f"view{number}"] = _row(invert_rigid(true_camera), invert_rigid(camera), source)
+    return rows | _path_errors(there, here, points)
+
+
+def _path_errors(truth: dict[str, Tensor], estimate: dict[str, Tensor], points: ReferencePoints) -> dict[str, float]:
+    plan = points.plan
+    if plan is None or plan.object not in truth or plan.object not in estimate:
+        return {}
+    true_pose, pose = truth[plan.object], estimate[plan.object]
+    entry = _displacement(true_pose, pose, plan.entry_point)
     metrics = {
         "entry_point_mm": entry.norm().item(),
-        "path_deg": _angle_deg(truth.camera1_from_femur, estimate.camera1_from_femur, path),
+        "path_deg": _angle_deg(true_pose, pose, plan.target - plan.entry_point),
     }
-    true_device, device = truth.camera1_from_device, estimate.camera1_from_device
-    if true_device is not None and device is not None and points.device is not None:
-        rows["device"] = _row(true_device, device, points.device["center"])
-        tip = _displacement(true_device, device, points.device["tip"])
-        metrics["tip_mm"] = tip.norm().item()
-        metrics["relative_mm"] = (entry - tip).norm().item()
-        metrics["guide_deg"] = _angle_deg(true_device, device, points.device["tip"] - points.device["base"])
-
-    source = torch.zeros(3, dtype=torch.float64)
-    views = zip(_camera1_from_camera(truth)[1:], _camera1_from_camera(estimate)[1:], strict=True)
-    for number, (true_pose, pose) in enumerate(views, 2):
-        rows[f"view{number}"] = _row(true_pose, pose, source)
-    return rows | metrics
-
-
-def _camera1_from_camera(poses: Truth) -> Tensor:
-    return poses.camera_from_pelvis[0] @ invert_rigid(poses.camera_from_pelvis)
+    if plan.tool is None or points.guide is None or plan.tool not in truth or plan.tool not in estimate:
+        return metrics
+    base, end = points.guide
+    tip = _displacement(truth[plan.tool], estimate[plan.tool], end)
+    return metrics | {
+        "tip_mm": tip.norm().item(),
+        "relative_mm": (entry - tip).norm().item(),
+        "guide_deg": _angle_deg(truth[plan.tool], estimate[plan.tool], end - base),
+    }
 
 
 def _displacement(true_pose: Tensor, pose: Tensor, point: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,17 +11,17 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from femoreg_torch.case import RESULT_NAME, Case
-from femoreg_torch.case.fields import Fields
+from femoreg_torch.case import Case, Result, Verdict
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation.overlay import GREEN, RED, Picture, edges_of, monitor_picture
+from femoreg_torch.evaluation.fit import check_fits
+from femoreg_torch.evaluation.overlay import GREEN, RED, Picture, edges_of, monitor_picture, new_objects
 from femoreg_torch.files import temporary_file
 from femoreg_torch.fluoro import downsample
-from femoreg_torch.geometry import Camera
-from femoreg_torch.registration import Poses, Scene, prepare_scene
-from femoreg_torch.registration.scene import Kind, first_view_only
-from femoreg_torch.similarity import GradNcc, grad_ncc
+from femoreg_torch.geometry import Camera, Poses
+from femoreg_torch.registration import Scene, prepare_scene
+from femoreg_torch.registration.scene import Kind
+from femoreg_torch.similarity import FixedSimilarity, GradNcc
 
 _PANEL_PX = 256  # width of one image, or a little more: the detector is averaged over whole blocks
 _BAR_PX = 22  # height of a line of text
@@ -43,16 +42,17 @@ class Frame:
     milliseconds: int
 
 
-def write_replay(path: Path, case: Case, result: dict[str, Any]) -> None:
+def write_replay(path: Path, case: Case, result: Result) -> None:
     """Write the replay of a result as an animated GIF, whole or not at all.
 
-    `result` is what `read_result` gives. Raises `InputError` for another suffix, or a result that does not fit the case
-    or holds no moments.
+    Raises `InputError` for another suffix, or a result that does not fit the case or holds no moments.
     """
     if path.suffix.lower() != ".gif":
         raise InputError(f"{path}: the replay is an animated GIF. Choose a name that ends in .gif.")
-    frames = list(frames_of(result, case))
-    pictures = [_indexed(picture) for picture in draw_frames(case, prepare_scene(case), frames, _verdict(result))]
+    check_fits(case, result)
+    scene = prepare_scene(case)
+    frames = list(frames_of(result, scene))
+    pictures = [_indexed(picture) for picture in draw_frames(case, scene, frames, _verdict(result.verdict))]
     with temporary_file(path) as part:
         pictures[0].save(
             part,
@@ -63,60 +63,49 @@ def write_replay(path: Path, case: Case, result: dict[str, Any]) -> None:
         )
 
 
-def frames_of(result: dict[str, Any], case: Case) -> Iterator[Frame]:
-    """The start pose, the moments of every stage, and the end, from the content of a result.
+def frames_of(result: Result, scene: Scene) -> Iterator[Frame]:
+    """The start pose, the moments of every stage, and the end.
 
-    Raises `InputError` if it holds no stages with moments or is of another number of views.
+    Raises `InputError` if the result does not tell where it started, or holds stages without moments.
     """
-    top = Fields(result, RESULT_NAME)
-    if len(result["camera_from_pelvis"]) != len(case.views):
-        raise InputError(
-            f"{RESULT_NAME}: {len(result['camera_from_pelvis'])} views, but {case.folder} has {len(case.views)}. Name "
-            "the case that was registered."
-        )
-    pelvis = top.mapping("start").transform("camera1_from_pelvis")
-    start = {"pelvis": pelvis, "femur": pelvis}
-    if "camera1_from_device" in result and case.device is not None:
-        start["device"] = case.device.camera1_from_device
-    poses, views, objects = first_view_only(start, len(case.views)), frozenset({0}), frozenset({"pelvis", "femur"})
-    yield Frame("start: landmarks of the network, PnP", "", poses, views, objects, _STAGE_MS)
-    stages = top.mappings("stages")
-    for number, stage in enumerate(stages, 1):
-        after = _poses(stage, poses)
-        if "view" in stage:
-            views |= {int(stage.number("view")) - 1}
-        if not torch.equal(after.camera1_from.get("device", pelvis), poses.camera1_from.get("device", pelvis)):
-            objects |= {"device"}
-        name = f"{number}/{len(stages)} {stage.value('name', 'the name of the stage')}"
-        name += f", view {int(stage.number('view'))}" if "view" in stage else ""
-        if "moments" not in stage:
-            raise InputError(f"{stage.where('moments')}: missing, so there is nothing to replay. Register again.")
-        for moment in stage.mappings("moments"):
-            yield Frame(name, _detail(moment), _poses(moment, poses), views, objects, _MOMENT_MS)
-        poses = after
-        yield Frame(name, _detail(stage), poses, views, objects, _END_MS if number == len(stages) else _STAGE_MS)
+    if result.start is None:
+        raise InputError("the result does not tell where it started, so there is nothing to replay. Register again.")
+    if not any(stage.moments for stage in result.stages):
+        raise InputError("no stage of the result holds moments, so there is nothing to replay. Register again.")
+    poses = scene.start(result.start.camera1_from_object)
+    poses = Poses(
+        poses.camera_from_camera1, {n: p for n, p in poses.camera1_from.items() if n in result.poses.camera1_from}
+    )
+    views = frozenset({0}) if scene.camera_from_camera1 is None else frozenset(range(scene.views))
+    # what is seen in the first images lies near its place from the start; what comes with others, when it has moved
+    objects = frozenset(name for name in scene.shown(poses.camera1_from, scene.first_kind))
+    yield Frame(f"start: {result.start.source}", "", poses, views, objects, _STAGE_MS)
+    for number, stage in enumerate(result.stages, 1):
+        if stage.view is not None:
+            views |= {stage.view - 1}
+        elif not torch.equal(stage.poses.camera_from_camera1, poses.camera_from_camera1):
+            views |= set(range(scene.views))
+        objects |= {
+            name
+            for name, pose in stage.poses.camera1_from.items()
+            if name in poses.camera1_from and not torch.equal(pose, poses.camera1_from[name])
+        }
+        name = f"{number}/{len(result.stages)} {stage.name}"
+        name += f", view {stage.view}" if stage.view is not None else ""
+        for moment in stage.moments:
+            yield Frame(name, _detail(moment.evaluations, moment.cost), moment.poses, views, objects, _MOMENT_MS)
+        poses = stage.poses
+        end = _END_MS if number == len(result.stages) else _STAGE_MS
+        yield Frame(name, _detail(stage.evaluations, stage.cost), poses, views, objects, end)
 
 
-def _detail(fields: Fields) -> str:
-    return f"{int(fields.number('evaluations'))} evaluations, cost {fields.number('cost'):.4f}"
+def _detail(evaluations: int, cost: float) -> str:
+    return f"{evaluations} evaluations, cost {cost:.4f}"
 
 
-def _poses(fields: Fields, before: Poses) -> Poses:
-    """The poses before, with those that stand in `fields` in their place."""
-    poses = before
-    if "camera_from_camera1" in fields:
-        poses = Poses(fields.transforms("camera_from_camera1"), poses.camera1_from)
-    placed = fields.mapping("camera1_from")
-    for name in placed.content:
-        poses = poses.with_object(name, placed.transform(name))
-    return poses
-
-
-def _verdict(result: dict[str, Any]) -> tuple[str, tuple[int, int, int]]:
+def _verdict(verdict: Verdict) -> tuple[str, tuple[int, int, int]]:
     """What the last line says, and its colour."""
-    if result.get("trusted") is True:
-        return "no check of the registration failed", GREEN
-    return "NOT TO BE TRUSTED: see quality in result.json", RED
+    return ("trusted: every check passed", GREEN) if verdict.trusted else ("NOT TRUSTED: see the report", RED)
 
 
 def draw_frames(
@@ -126,23 +115,25 @@ def draw_frames(
 
     `verdict` is told on the last one.
     """
-    camera = scene.carm.camera.downsampled(max(1, scene.carm.camera.shape[1] // _PANEL_PX))
-    factor = scene.carm.camera.shape[1] // camera.shape[1]
-    kinds: list[Kind] = [kind for kind in ("anatomy", "device") if kind in scene.images]
+    factor = max(1, scene.carm.camera.shape[1] // _PANEL_PX)
+    camera = scene.carm.camera.downsampled(factor)
+    new = new_objects(scene)
     backgrounds: dict[tuple[Kind, int], Picture] = {}
-    similarities: dict[tuple[Kind, int], GradNcc] = {}
-    for number, view in enumerate(case.views):
-        for kind in kinds:
-            image = view.anatomy if kind == "anatomy" or view.device is None else view.device
-            backgrounds[kind, number] = monitor_picture(image, view.intensity, case, camera)
-            similarities[kind, number] = grad_ncc(downsample(scene.images[kind][number], factor), _PATCH_RADIUS)
+    similarities: dict[tuple[Kind, int], FixedSimilarity] = {}
+    for kind, images in scene.images.items():
+        for number, image in enumerate(images):
+            small = downsample(image, factor)
+            backgrounds[kind, number] = monitor_picture(small)
+            similarities[kind, number] = GradNcc(_PATCH_RADIUS).against(small, None)
     renderer = _Renderer(scene, camera)
     for index, frame in enumerate(frames):
         rows = []
-        for kind in kinds:
+        for kind in scene.images:
+            drawn = [name for name in scene.shown(frame.poses.camera1_from, kind) if name in frame.objects]
+            edged = [name for name in new[kind] if name in drawn]
             panels = [
-                _panel(backgrounds[kind, view].copy(), kind, view, frame, renderer, similarities[kind, view])
-                for view in range(len(case.views))
+                _panel(backgrounds[kind, view].copy(), view, edged, drawn, frame, renderer, similarities[kind, view])
+                for view in range(scene.views)
             ]
             rows.append(np.hstack(panels))
         width = rows[0].shape[1]
@@ -169,16 +160,22 @@ class _Renderer:
         return drawn
 
 
-def _panel(picture: Picture, kind: Kind, view: int, frame: Frame, renderer: _Renderer, similarity: GradNcc) -> Picture:
-    """One image with what has its place in it by then, and the similarity of all that is drawn."""
-    shown = frame.objects & ({"device"} if kind == "device" else {"pelvis", "femur"})
-    if view not in frame.views or not shown:
+def _panel(
+    picture: Picture,
+    view: int,
+    edged: list[str],
+    drawn: list[str],
+    frame: Frame,
+    renderer: _Renderer,
+    similarity: FixedSimilarity,
+) -> Picture:
+    """One image with the edges of what it shows first and has its place by then, and the similarity of all drawn."""
+    if view not in frame.views or not edged:
         picture //= 2
         return picture
-    for name in sorted(shown):
+    for name in edged:
         picture[edges_of(renderer(frame.poses, name, view))] = GREEN
-    names = sorted(frame.objects if kind == "device" else shown)
-    total = torch.stack([renderer(frame.poses, name, view) for name in names]).sum(0)
+    total = torch.stack([renderer(frame.poses, name, view) for name in drawn]).sum(0)
     text = f"view {view + 1}, similarity {1 - float(similarity(total[None])[0]):.3f}"
     picture[-_BAR_PX:] //= 3
     cv2.putText(picture, text, (6, picture.shape[0] - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _WHITE, 1, cv2.LINE_AA)

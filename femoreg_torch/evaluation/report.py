@@ -1,17 +1,16 @@
 """The report of one registration: a single HTML file that needs nothing beside it."""
 
 import base64
+import math
 from collections.abc import Iterable, Sequence
 from html import escape
-from pathlib import Path
 from typing import Any
 
 import cv2
 
-from femoreg_torch.case import Case
+from femoreg_torch.case import Case, Result, Verdict
 from femoreg_torch.evaluation.overlay import Picture
 from femoreg_torch.evaluation.table import METRIC_COLUMNS, POSE_COLUMNS, metric_rows, pose_rows
-from femoreg_torch.files import write_text
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; color: #1c2430; }
@@ -27,20 +26,18 @@ _NOTICE = "Research software, not a medical device: its output must not guide th
 _SIMULATED = "The images of this case are simulated, and so is the truth that the errors are measured against."
 
 
-def write_report(
-    path: Path, case: Case, result: dict[str, Any], errors: dict[str, Any] | None, overlay: Picture
-) -> None:
-    """Write the report of a registration as one HTML file, whole or not at all.
+def report_page(case: Case, result: Result, errors: dict[str, Any] | None, overlay: Picture) -> str:
+    """The report of a registration as the text of one HTML file.
 
-    `result` is what `read_result` gives; `errors` are those against the truth, None if there is none; `overlay` is the
-    picture of `overlay_figure`.
+    `errors` are those against the truth, None if there is none; `overlay` is the picture of `overlay_figure`.
     """
+    side = f"{case.side} side, " if case.side else ""
     parts = [
         f"<h1>Registration of {escape(case.folder.resolve().name)}</h1>",
-        f"<p>{escape(case.side)} hip, {len(case.views)} views, preset <b>{escape(str(result.get('preset')))}</b>, "
-        f"seed {escape(str(result.get('seed')))}</p>",
+        f"<p>{escape(side)}{len(case.views)} views, preset <b>{escape(result.preset)}</b>, seed {result.seed}</p>",
         f'<p class="notice">{_NOTICE}{" " + _SIMULATED if case.truth is not None else ""}</p>',
-        _verdict(result),
+        _verdict(result.verdict),
+        _skipped(result.skipped),
     ]
     if errors is not None:
         parts += [
@@ -50,25 +47,24 @@ def write_report(
             _table(METRIC_COLUMNS, metric_rows(errors)),
             _table(POSE_COLUMNS, pose_rows(errors)),
         ]
-    parts += ["<h2>Overlays</h2>", _figure(overlay), "<h2>Result</h2>", _points(result)]
-    parts += ["<h2>Quality</h2>", _table(*_quality(result.get("quality", {})))]
-    parts += ["<h2>Time</h2>", _table(("step", "s"), ([k, f"{v:.1f}"] for k, v in result.get("timings_s", {}).items()))]
-    parts += ["<h2>Versions</h2>", _table(("", ""), ([k, str(v)] for k, v in result.get("versions", {}).items()))]
+    parts += ["<h2>Overlays</h2>", _figure(overlay, case), "<h2>Result</h2>", _points(result)]
+    parts += ["<h2>Quality</h2>", _QUALITY_NOTE, _table(_QUALITY_COLUMNS, _quality(result))]
+    parts += ["<h2>Time</h2>", _table(("step", "s"), ([k, f"{v:.1f}"] for k, v in result.timings_s.items()))]
+    parts += ["<h2>Versions</h2>", _table(("", ""), ([k, v] for k, v in result.versions.items()))]
     body = "\n".join(parts)
     title = f"FemoReg Torch: {escape(case.folder.resolve().name)}"
     head = f'<meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
-    write_text(path, f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n')
+    return f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
 
 
-def _verdict(result: dict[str, Any]) -> str:
-    doubts = [
-        f"{name}: {value.get('reason', 'no reason given')}"
-        for name, value in result.get("quality", {}).items()
-        if isinstance(value, dict) and value.get("trusted") is False
-    ]
-    if doubts:
-        return f'<p class="bad">Not to be trusted. {escape("; ".join(doubts))}</p>'
-    return '<p class="good">No check of the registration failed.</p>'
+def _verdict(verdict: Verdict) -> str:
+    return f'<p class="{"good" if verdict.trusted else "bad"}">{escape(verdict.sentence)}</p>'
+
+
+def _skipped(skipped: Sequence[str]) -> str:
+    if not skipped:
+        return ""
+    return "<p>What was left out:</p><ul>" + "".join(f"<li>{escape(note)}</li>" for note in skipped) + "</ul>"
 
 
 def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -80,43 +76,65 @@ def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
 
 
-def _figure(picture: Picture) -> str:
+def _figure(picture: Picture, case: Case) -> str:
     encoded, data = cv2.imencode(".png", picture)
     if not encoded:
         raise OSError("the overlay could not be encoded as PNG.")
     source = base64.b64encode(data.tobytes()).decode("ascii")
     caption = (
-        "The views from left to right, without and with the device, as on a monitor (bone dark, the patient's left on "
-        "the right). Green: edges of the rendered bones and of the device at the estimated poses. Red: landmarks of "
-        "the CT. Magenta: planned path."
+        "The views from left to right, a row for each kind of images, as on a monitor (bone dark). Green: edges of the "
+        "objects, rendered at the estimated poses, in the first images that show them."
     )
+    caption += " Red: landmarks of the CT." if case.landmarks else ""
+    caption += " Magenta: planned path." if case.plan is not None else ""
     image = f'<img alt="overlays" src="data:image/png;base64,{source}">'
     return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 
 
-def _points(result: dict[str, Any]) -> str:
+def _points(result: Result) -> str:
     rows = [
         [name.replace("_", " "), *(f"{value:.{digits}f}" for value in vector.tolist()), unit]
-        for key, digits, unit in (("points_camera1", 2, "mm"), ("directions_camera1", 4, ""))
-        for name, vector in result.get(key, {}).items()
+        for vectors, digits, unit in ((result.points_camera1, 2, "mm"), (result.directions_camera1, 4, ""))
+        for name, vector in vectors.items()
     ]
     return "<p>In the camera frame of view 1.</p>" + _table(("", "x", "y", "z", ""), rows)
 
 
-def _quality(quality: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Columns and rows of whatever the registration says of each object's quality."""
-    columns = list(dict.fromkeys(key for value in quality.values() for key in value))
-    rows = [[name, *(_short(value.get(key)) for key in columns)] for name, value in quality.items()]
-    return ["object", *(key.replace("_", " ") for key in columns)], rows
+_QUALITY_NOTE = (
+    "<p>Standard deviations are the largest along and about any axis. The pull is where all images together would move "
+    "the object, were everything free. Similarity is mean patch Grad-NCC, at most 1; gain is what drawing the object "
+    "adds to it, in the view where it adds least.</p>"
+)
+_QUALITY_COLUMNS = (
+    "object",
+    "trusted",
+    "because",
+    "deviation mm",
+    "deviation °",
+    "pull mm",
+    "pull °",
+    "similarity",
+    "gain",
+)
 
 
-def _short(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.3g}"
-    if isinstance(value, list):
-        return ", ".join(_short(v) for v in value)
-    if isinstance(value, dict):
-        return ", ".join(f"{k} {_short(v)}" for k, v in value.items())
-    return "" if value is None else str(value)
+def _quality(result: Result) -> Iterable[list[str]]:
+    """A row for every object."""
+    for name, quality in result.quality.items():
+        similarities = [view.similarity for view in quality.views]
+        gains = [view.gain for view in quality.views]
+        yield [
+            name,
+            "yes" if quality.trusted else "no",
+            quality.reason,
+            _number(max(quality.translation_deviation_mm, default=math.nan), 2),
+            _number(max(quality.rotation_deviation_deg, default=math.nan), 2),
+            _number(quality.common_pull[1], 2),
+            _number(quality.common_pull[0], 2),
+            _number(sum(similarities) / len(similarities) if similarities else math.nan, 3),
+            _number(min(gains, default=math.nan), 3),
+        ]
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "unknown"

@@ -5,30 +5,41 @@ from typing import Any
 
 import cv2
 
-from femoreg_torch.case import Case, Truth
+from femoreg_torch.case import Case, Result, new_folder
 from femoreg_torch.evaluation.errors import errors, reference_points
+from femoreg_torch.evaluation.fit import check_fits
 from femoreg_torch.evaluation.overlay import overlay_figure
-from femoreg_torch.evaluation.report import write_report
-from femoreg_torch.files import temporary_file, write_json
+from femoreg_torch.evaluation.report import report_page
+from femoreg_torch.files import write_json, write_text
+from femoreg_torch.registration import Scene, prepare_scene
+
+ERRORS_NAME, OVERLAY_NAME, REPORT_NAME = "errors.json", "overlay.png", "report.html"
+EVALUATION_NAMES = (ERRORS_NAME, OVERLAY_NAME, REPORT_NAME)
 
 
-def evaluate_run(case: Case, result: dict[str, Any], run: Path) -> dict[str, Any] | None:
-    """Write `errors.json` (if the case has a truth), `overlay.png` and `report.html` into `run`; returns the errors.
+def evaluate(case: Case, result: Result, scene: Scene | None = None) -> dict[str, Any] | None:
+    """Errors of a result against the truth of its case, see `errors`; None if the case has no truth.
 
-    `result` is what `read_result` gives. Raises `InputError` if it does not fit the case.
+    Raises `InputError` if the result does not fit the case.
     """
-    poses = poses_of(result)
-    found = None if case.truth is None else errors(case.truth, poses, reference_points(case))
-    overlay = overlay_figure(case, poses)
-    if found is not None:
-        write_json(run / "errors.json", found)
-    with temporary_file(run / "overlay.png") as part:
-        if not cv2.imwrite(str(part), overlay):
-            raise OSError(f"{run / 'overlay.png'}: the picture could not be written.")
-    write_report(run / "report.html", case, result, found, overlay)
+    check_fits(case, result)
+    return None if case.truth is None else errors(case.truth, result.poses, reference_points(case, scene))
+
+
+def write_report(case: Case, result: Result, run: Path) -> dict[str, Any] | None:
+    """Write `errors.json` (if the case has a truth), `overlay.png` and `report.html` into `run`, all or none.
+
+    Returns the errors. Raises `InputError` if the result does not fit the case.
+    """
+    check_fits(case, result)
+    scene = prepare_scene(case)
+    found = evaluate(case, result, scene)
+    overlay = overlay_figure(case, scene, result.poses)
+    page = report_page(case, result, found, overlay)
+    with new_folder(run, without=EVALUATION_NAMES) as folder:
+        if found is not None:
+            write_json(folder / ERRORS_NAME, found)
+        if not cv2.imwrite(str(folder / OVERLAY_NAME), overlay):
+            raise OSError(f"{run / OVERLAY_NAME}: the picture could not be written.")
+        write_text(folder / REPORT_NAME, page)
     return found
-
-
-def poses_of(result: dict[str, Any]) -> Truth:
-    """The poses of a result in the form of a truth."""
-    return Truth(result["camera_from_pelvis"], result["camera1_from_femur"], result.get("camera1_from_device"))

@@ -1,38 +1,24 @@
-"""Errors as tables, with the means of the paper's simulation study beside them."""
+"""Errors as tables, with the means of the paper's simulation study beside the rows that have the same name there."""
 
 from collections.abc import Iterator
 from typing import Any
 
 from rich.table import Table
 
+from femoreg_torch.configs import load_preset
+
 AXES = ("IS", "LR", "AP")
 
-# Gao et al., IEEE Trans Med Robot Bionics 2 (2020) 437, Table I: mean errors over 1,000 simulations,
+_PAPER = load_preset("paper", "gao2020")
 # (mm along IS, LR, AP, total), (degrees about IS, LR, AP, total)
-PAPER_POSES = {
-    "pelvis": ((0.23, 0.11, 0.85, 0.92), (0.11, 0.08, 0.06, 0.17)),
-    "femur": ((0.14, 0.12, 0.77, 0.81), (0.65, 0.25, 0.11, 0.73)),
-    "device": ((0.22, 0.39, 0.85, 1.00), (0.13, 0.14, 0.08, 0.23)),
-    "view2": ((0.36, 0.19, 1.23, 1.37), (0.09, 0.15, 0.10, 0.23)),
-    "view3": ((0.22, 0.23, 0.55, 0.69), (0.10, 0.08, 0.05, 0.16)),
-}
-# Table II: means
-PAPER_METRICS = {
-    "entry_point_mm": 1.70,
-    "tip_mm": 0.93,
-    "relative_mm": 1.26,
-    "path_deg": 0.63,
-    "guide_deg": 0.17,
-}
+PAPER_POSES = {name: (tuple(row["mm"]), tuple(row["deg"])) for name, row in _PAPER["poses"].items()}
+PAPER_METRICS: dict[str, float] = _PAPER["metrics"]
 _NAMES = {
-    "pelvis": "pelvis",
-    "femur": "femur",
-    "device": "device",
     "entry_point_mm": "entry point",
     "tip_mm": "guide tip",
     "relative_mm": "entry point to tip",
-    "path_deg": "femur path",
-    "guide_deg": "guide path",
+    "path_deg": "planned path",
+    "guide_deg": "guide",
 }
 
 POSE_COLUMNS = ("", *(f"{axis} mm" for axis in AXES), "total mm", *(f"{axis} °" for axis in AXES), "total °")

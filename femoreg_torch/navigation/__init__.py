@@ -3,13 +3,13 @@
 from femoreg_torch.navigation.guidance import Guidance, guide
 from femoreg_torch.navigation.report import NAVIGATION_NAME, navigation_content, summary
 from femoreg_torch.navigation.robot import Robot, read_robot
-from femoreg_torch.navigation.writing import clear_navigation, write_navigation
+from femoreg_torch.navigation.writing import NAVIGATION_NAMES, write_navigation
 
 __all__ = [
     "NAVIGATION_NAME",
+    "NAVIGATION_NAMES",
     "Guidance",
     "Robot",
-    "clear_navigation",
     "guide",
     "navigation_content",
     "read_robot",

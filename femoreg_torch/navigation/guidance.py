@@ -1,21 +1,23 @@
-"""The guide against the planned path, and the smallest motion of the device that brings it there."""
+"""The guide of a tool against the planned path, and the smallest motion of the tool that brings it there."""
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from femoreg_torch.case import Result
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import exp_so3, invert_rigid, rigid, transform_points
 
 
 @dataclass(frozen=True, eq=False)
 class Guidance:
-    """Guide and plan as registered. Points and unit directions are (3,), float64, in the device's frame (CAD, mm)."""
+    """Guide and plan as registered. Points and unit directions are (3,), float64, in the tool's frame (CAD, mm)."""
 
-    femur_from_device: Tensor  # (4, 4)
+    object: str  # the object with the planned path
+    tool: str  # the object with the guide
+    object_from_tool: Tensor  # (4, 4)
     entry_point: Tensor
     tip: Tensor
     path: Tensor  # from the entry point to the target
@@ -23,7 +25,7 @@ class Guidance:
 
     @property
     def tip_offset(self) -> Tensor:
-        """Tip minus entry point (3,), mm, in the device's frame."""
+        """Tip minus entry point (3,), mm, in the tool's frame."""
         return self.tip - self.entry_point
 
     @property
@@ -33,10 +35,10 @@ class Guidance:
 
     @property
     def correction(self) -> Tensor:
-        """The motion (4, 4) of the device, in its frame as registered, after which it stands as planned.
+        """The motion (4, 4) of the tool, in its frame as registered, after which it stands as planned.
 
-        A point x of the device moves to `correction @ x`, so that
-        `femur_from_device @ correction` is the pose to reach. The guide comes to lie on the planned path with its tip
+        A point x of the tool moves to `correction @ x`, so that
+        `object_from_tool @ correction` is the pose to reach. The guide comes to lie on the planned path with its tip
         at the entry point. That leaves the turn about the guide free; of all rotations that take one direction to
         another, that about their common normal is the smallest, and it is the one taken.
         """
@@ -44,19 +46,24 @@ class Guidance:
         return rigid(rotation, self.entry_point - rotation @ self.tip)
 
 
-def guide(result: dict[str, Any]) -> Guidance:
-    """Guide and plan from the content of a result, with tensors as `read_result` gives them.
-
-    Raises `InputError` if no device was registered.
-    """
-    if "camera1_from_device" not in result:
-        raise InputError("no device was registered, so there is nothing to steer. Give device images for every view.")
-    device_from_camera1 = invert_rigid(result["camera1_from_device"])
-    points, directions = result["points_camera1"], result["directions_camera1"]
-    entry_point, tip = transform_points(device_from_camera1, torch.stack([points["entry_point"], points["tip"]]))
-    path, axis = (device_from_camera1[:3, :3] @ directions[name] for name in ("path", "guide"))
-    femur_from_device = invert_rigid(result["camera1_from_femur"]) @ result["camera1_from_device"]
-    return Guidance(femur_from_device, entry_point, tip, path / path.norm(), axis / axis.norm())
+def guide(result: Result) -> Guidance:
+    """Guide and plan of a result. Raises `InputError` if no tool, or no planned path, was registered."""
+    name, tool = result.path or (None, None)
+    object_from_tool = result.object_from_tool
+    if name is None or tool is None or object_from_tool is None:
+        raise InputError("no tool was registered, so there is nothing to steer. Give images of it for every view.")
+    for where, known, keys in (
+        ("points_camera1", result.points_camera1, ("entry_point", "tip")),
+        ("directions_camera1", result.directions_camera1, ("path", "guide")),
+    ):
+        for key in keys:
+            if key not in known:
+                raise InputError(f"{where}.{key}: missing from the result. Register again.")
+    tool_from_camera1 = invert_rigid(result.poses.camera1_from[tool])
+    points = torch.stack([result.points_camera1["entry_point"], result.points_camera1["tip"]])
+    entry_point, tip = transform_points(tool_from_camera1, points)
+    path, axis = (tool_from_camera1[:3, :3] @ result.directions_camera1[key] for key in ("path", "guide"))
+    return Guidance(name, tool, object_from_tool, entry_point, tip, path / path.norm(), axis / axis.norm())
 
 
 def _angle(a: Tensor, b: Tensor) -> float:

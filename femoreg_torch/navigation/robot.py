@@ -1,4 +1,4 @@
-"""The robot's calibration: where its base sees the device at the moment of the device images."""
+"""The robot's calibration: where its base sees the tool at the moment of the tool's images."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,50 +10,67 @@ from torch import Tensor
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import check_rigid, invert_rigid, rigid
 
-_DIRECT = {"base_from_device"}
-_BY_FLANGE = {"base_from_flange", "flange_from_device"}
-_FORMAT = (
-    "a line `base_from_device` and four rows of four numbers below it, or the same for both `base_from_flange` and "
-    "`flange_from_device`, in mm"
-)
-_LEAST_REACH_MM = 10.0  # no device stands this close to the base of its robot: the numbers are metres
+_LEAST_REACH_MM = 10.0  # no tool stands this close to the base of its robot: the numbers are metres
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """Poses (4, 4), float64, mm, at the moment of the device images; the flange's only where the file tells it."""
+    """Poses (4, 4), float64, mm, at the moment of the tool's images; the flange's only where the file tells it."""
 
-    base_from_device: Tensor
+    base_from_tool: Tensor
     base_from_flange: Tensor | None = None
 
 
-def read_robot(path: Path) -> Robot:
-    """The calibration in a file: 4×4 text with named matrices, or an ITK `.tfm` named `base_from_device.tfm`.
+@dataclass(frozen=True)
+class _Names:
+    """What the matrices of a calibration are called, after the tool."""
+
+    tool: str
+
+    @property
+    def direct(self) -> set[str]:
+        return {f"base_from_{self.tool}"}
+
+    @property
+    def by_flange(self) -> set[str]:
+        return {"base_from_flange", f"flange_from_{self.tool}"}
+
+    @property
+    def format(self) -> str:
+        """What a file holds, in words."""
+        return (
+            f"a line `base_from_{self.tool}` and four rows of four numbers below it, or the same for both "
+            f"`base_from_flange` and `flange_from_{self.tool}`, in mm"
+        )
+
+
+def read_robot(path: Path, tool: str) -> Robot:
+    """The calibration in a file: 4×4 text with named matrices, or an ITK `.tfm` named `base_from_<tool>.tfm`.
 
     Text: `#` starts a comment; a line with a name says which frames the four rows below it tie. A file of one matrix
     may leave the line out if the file itself bears the name. A `.tfm` is in ITK's direction, as 3D Slicer saves it: it
-    takes points of the base to the device. Raises `InputError` that names file and matrix for whatever is not rigid,
+    takes points of the base to the tool. Raises `InputError` that names file and matrix for whatever is not rigid,
     not finite, of another shape, missing or unknown, or in metres.
     """
-    path = Path(path)
+    path, names = Path(path), _Names(tool)
     if not path.is_file():
-        raise InputError(f"{path}: no such file. The robot's calibration holds {_FORMAT}.")
-    found = {path.stem: _read_tfm(path)} if path.suffix.lower() == ".tfm" else _read_text(path)
-    if set(found) not in (_DIRECT, _BY_FLANGE):
-        names = ", ".join(f"`{name}`" for name in found) or "no matrix"
-        raise InputError(f"{path}: holds {names}. Expected: {_FORMAT}.")
+        raise InputError(f"{path}: no such file. The robot's calibration holds {names.format}.")
+    found = {path.stem: _read_tfm(path)} if path.suffix.lower() == ".tfm" else _read_text(path, names)
+    if set(found) not in (names.direct, names.by_flange):
+        there = ", ".join(f"`{name}`" for name in found) or "no matrix"
+        raise InputError(f"{path}: holds {there}. Expected: {names.format}.")
     poses = {name: _exactly_rigid(check_rigid(matrix, f"{path}, {name}")) for name, matrix in found.items()}
     base_from_flange = poses.get("base_from_flange")
     if base_from_flange is None:
-        base_from_device = poses["base_from_device"]
+        base_from_tool = poses[f"base_from_{tool}"]
     else:
-        base_from_device = base_from_flange @ poses["flange_from_device"]
-    if (distance := base_from_device[:3, 3].norm().item()) < _LEAST_REACH_MM:
+        base_from_tool = base_from_flange @ poses[f"flange_from_{tool}"]
+    if (distance := base_from_tool[:3, 3].norm().item()) < _LEAST_REACH_MM:
         raise InputError(
-            f"{path}: the device would stand {distance:.3g} mm from the robot's base. Are the translations in metres? "
+            f"{path}: the {tool} would stand {distance:.3g} mm from the robot's base. Are the translations in metres? "
             "Write them in mm."
         )
-    return Robot(base_from_device, base_from_flange)
+    return Robot(base_from_tool, base_from_flange)
 
 
 def _exactly_rigid(pose: Tensor) -> Tensor:
@@ -62,16 +79,16 @@ def _exactly_rigid(pose: Tensor) -> Tensor:
     return rigid(u @ vh, pose[:3, 3])
 
 
-def _read_text(path: Path) -> dict[str, Tensor]:
+def _read_text(path: Path, names: _Names) -> dict[str, Tensor]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not text. Expected: {_FORMAT}.") from error
+        raise InputError(f"{path}: is not text. Expected: {names.format}.") from error
     name = path.stem
     rows: dict[str, list[list[float]]] = {}
     for number, line in enumerate(lines, 1):
         words = line.partition("#")[0].replace(",", " ").split()
-        if len(words) == 1 and words[0] in _DIRECT | _BY_FLANGE:
+        if len(words) == 1 and words[0] in names.direct | names.by_flange:
             name = words[0]
             if name in rows:
                 raise InputError(f"{path}, line {number}: `{name}` stands there twice. Keep one.")

@@ -1,6 +1,5 @@
 """Navigation on disk: `navigation.json`, and every transform as an ITK `.tfm` and as 4×4 text."""
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +10,21 @@ from femoreg_torch.geometry import invert_rigid
 from femoreg_torch.navigation.report import NAVIGATION_NAME, NOTICE
 
 FOLDER_NAME = "navigation"
+NAVIGATION_NAMES = (NAVIGATION_NAME, FOLDER_NAME)
 
-_MEANING = {
-    "femur_from_device": "takes points of the device (CAD, mm) to the femur (CT, LPS mm)",
-    "correction_in_device": "moves the device, in its frame as registered, onto the planned path, tip at entry point",
-    "correction_in_base": "the same motion in the robot's base: base_from_corrected_device = this @ base_from_device",
-    "base_from_femur": "takes points of the femur (CT, LPS mm) to the robot's base",
-    "base_from_corrected_device": "takes points of the device to the robot's base when it stands as planned",
-    "base_from_corrected_flange": "pose of the flange in the robot's base when the device stands as planned",
-}
+
+def meanings(name: str, tool: str) -> dict[str, str]:
+    """What each transform does, of a planned path in the object `name` and of its `tool`."""
+    return {
+        f"{name}_from_{tool}": f"takes points of the {tool} (CAD, mm) to the {name} (CT, LPS mm)",
+        f"correction_in_{tool}": f"moves the {tool}, in its frame as registered, onto the planned path, tip at "
+        "entry point",
+        "correction_in_base": f"the same motion in the robot's base: base_from_corrected_{tool} = "
+        f"this @ base_from_{tool}",
+        f"base_from_{name}": f"takes points of the {name} (CT, LPS mm) to the robot's base",
+        f"base_from_corrected_{tool}": f"takes points of the {tool} to the robot's base when it stands as planned",
+        "base_from_corrected_flange": f"pose of the flange in the robot's base when the {tool} stands as planned",
+    }
 
 
 def write_navigation(folder: Path, content: dict[str, Any]) -> None:
@@ -29,19 +34,12 @@ def write_navigation(folder: Path, content: dict[str, Any]) -> None:
     """
     write_json(folder / NAVIGATION_NAME, content)
     (folder / FOLDER_NAME).mkdir(exist_ok=True)
-    for name, meaning in _MEANING.items():
+    for name, meaning in meanings(content["object"], content["tool"]).items():
         if name in content:
             notes = [f"{name}: {meaning}", *(f"NOT TRUSTED: {reason}" for reason in content["reasons"]), NOTICE]
             notes = [" ".join(note.split()) for note in notes]
             write_text(folder / FOLDER_NAME / f"{name}.txt", _text(content[name], notes))
             write_text(folder / FOLDER_NAME / f"{name}.tfm", _tfm(content[name], notes))
-
-
-def clear_navigation(folder: Path) -> None:
-    """Remove the navigation of an earlier registration from a run's folder, if there is one."""
-    (folder / NAVIGATION_NAME).unlink(missing_ok=True)
-    if (folder / FOLDER_NAME).is_dir():
-        shutil.rmtree(folder / FOLDER_NAME)
 
 
 def _text(b_from_a: Tensor, notes: list[str]) -> str:

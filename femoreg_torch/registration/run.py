@@ -1,53 +1,178 @@
-"""One case registered, from its folder to the content of its result."""
+"""One case registered, from its folder to a `Result`."""
 
+import platform
 import time
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from femoreg_torch.case import Case
+import numpy
+import torch
+from torch import Tensor
+
+import femoreg_torch
+from femoreg_torch.case import Case, Result, Start, StartRecord
+from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.detect import detect, load_network
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import check_rigid
 from femoreg_torch.registration.plan import Plan, load_plan
 from femoreg_torch.registration.prepare import prepare_scene
 from femoreg_torch.registration.quality import Limits, assess
-from femoreg_torch.registration.report import result_content
-from femoreg_torch.registration.start import Detector, start_from_landmarks, with_segmentations
+from femoreg_torch.registration.scene import Scene
+from femoreg_torch.registration.start import Detector, start_by_detection, start_by_landmarks, with_segmentations
 from femoreg_torch.registration.workflow import Report, run_plan
 
 
-def register_case(case: Case, preset: str, seed: int, weights: Path | None, report: Report) -> dict[str, Any]:
-    """Register a case; returns the content of its `result.json` but for the errors against a truth.
+def silent(step: str, share: float) -> None:
+    """A report that tells nobody."""
 
-    `weights` are those of the landmark network, None for those shipped. Raises `InputError` for input that does not
-    fit.
+
+def network_detector(case: Case, weights: Path | None = None) -> Detector:
+    """The landmark network of a weights file, or the shipped one. Raises `InputError` if it knows another body part."""
+    network = load_network(weights)
+    if case.anatomy is not None and case.anatomy.landmark_names != network.anatomy.landmark_names:
+        raise InputError(
+            f"{case.folder}/case.yaml, anatomy: the network knows landmarks of the {network.anatomy.name}, not those "
+            f"of the {case.anatomy.name}. Give the weights of another one (--weights), landmarks in the image "
+            "(--landmarks), or a start pose (--start)."
+        )
+    return lambda image, camera: detect(network, image, camera)
+
+
+def register(
+    case: Case,
+    plan: Plan | str | Path = "fast",
+    *,
+    seed: int = 0,
+    find: Detector | None = None,
+    landmarks: Mapping[str, Tensor] | None = None,
+    start: Mapping[str, Tensor] | None = None,
+    camera_from_camera1: Tensor | None = None,
+    report: Report = silent,
+) -> Result:
+    """Register a case by a plan, or by the preset or YAML file of that name.
+
+    `start` has poses (4, 4) in camera 1 of objects by name, in place of how the case starts them. Objects that start
+    from landmarks are placed by `landmarks`, pixels (2,) (column, row) in the first image by name, or by what `find`
+    sees there, which is the shipped network if nothing is given. With `camera_from_camera1` (V, 4, 4) the C-arm's poses
+    are known and stay. Where a stage weighs pixels by the bones, `find` looks at every view.
+    Raises `InputError` for input that does not fit.
     """
-    plan, network = load_plan(preset), load_network(weights)
-    return register_by_plan(case, plan, seed, lambda image, camera: detect(network, image, camera), report)
+    scene = None
+    if camera_from_camera1 is not None:
+        cameras = camera_from_camera1.double()
+        if cameras.shape != (len(case.views), 4, 4):
+            raise InputError(
+                f"camera_from_camera1: ({len(case.views)}, 4, 4) was expected for the case's views, got "
+                f"{tuple(cameras.shape)}."
+            )
+        for number, pose in enumerate(cameras):
+            check_rigid(pose, f"camera_from_camera1[{number}]")
+        scene = replace(prepare_scene(case), camera_from_camera1=cameras)
+    return register_scene(case, scene, plan, seed=seed, find=find, landmarks=landmarks, start=start, report=report)[0]
 
 
-def register_by_plan(case: Case, plan: Plan, seed: int, find: Detector, report: Report) -> dict[str, Any]:
-    """The same by any plan, and from the landmarks that `find` sees in view 1.
-
-    Where a stage weighs pixels by the bones, `find` looks at every view.
-    """
+def register_scene(
+    case: Case,
+    scene: Scene | None,
+    plan: Plan | str | Path,
+    *,
+    seed: int,
+    find: Detector | None = None,
+    landmarks: Mapping[str, Tensor] | None = None,
+    start: Mapping[str, Tensor] | None = None,
+    report: Report = silent,
+) -> tuple[Result, Scene]:
+    """As `register`, from the scene of the case if it is there already; returns that as well."""
+    plan = plan if isinstance(plan, Plan) else load_plan(plan)
     clock = {"began": time.perf_counter()}
     report("reading CT and images", 0.0)
-    scene = prepare_scene(case)
+    scene = prepare_scene(case) if scene is None else scene
+    if start is not None:
+        scene = _started_at(scene, start)
     clock["prepared"] = time.perf_counter()
-    report("finding landmarks", 0.0)
-    seen = find(scene.images["anatomy"][0], scene.carm.camera)
-    camera1_from_pelvis, start = start_from_landmarks(case, scene, seen)
-    if plan.needs_segmentations:
-        scene = with_segmentations(scene, seen, find)
+    began, scene = _start(case, scene, plan, find, landmarks, report)
     clock["started"] = time.perf_counter()
-    outcome = run_plan(scene, plan, camera1_from_pelvis, seed, report)
+    anchor = began.camera1_from_object if scene.needs_landmarks else None
+    outcome = run_plan(scene, plan, anchor, seed, report)
     clock["registered"] = time.perf_counter()
     quality = assess(scene, outcome.poses, Limits(), plan.imaging, outcome.trace)
     done = time.perf_counter()
-    timings = {
-        "reading": clock["prepared"] - clock["began"],
-        "detection": clock["started"] - clock["prepared"],
-        "registration": clock["registered"] - clock["started"],
-        "quality": done - clock["registered"],
-        "total": done - clock["began"],
-    }
-    return result_content(case, outcome, quality, start, timings, plan.preset, seed)
+    points, directions = path_in_camera1(case, outcome.poses)
+    result = Result(
+        poses=outcome.poses,
+        quality=quality,
+        start=began,
+        stages=tuple(outcome.trace),
+        skipped=(*scene.missing, *outcome.skipped, *_unchecked(case, scene, began)),
+        path=None if case.plan is None else (case.plan.object, case.plan.tool),
+        points_camera1=points,
+        directions_camera1=directions,
+        timings_s={
+            "reading": clock["prepared"] - clock["began"],
+            "detection": clock["started"] - clock["prepared"],
+            "registration": clock["registered"] - clock["started"],
+            "quality": done - clock["registered"],
+            "total": done - clock["began"],
+        },
+        preset=plan.preset,
+        seed=seed,
+        versions={
+            "femoreg_torch": femoreg_torch.__version__,
+            "torch": torch.__version__,
+            "numpy": numpy.__version__,
+            "python": platform.python_version(),
+        },
+    )
+    return result, scene
+
+
+def _unchecked(case: Case, scene: Scene, start: StartRecord) -> tuple[str, ...]:
+    """What was not asked of the start, in words."""
+    if start.silhouette_overlap is not None or case.anatomy is None or not case.anatomy.outline:
+        return ()
+    told = "" if scene.outline is not None else ", as the label map does not tell them apart"
+    return (f"the start ({start.source}) was not compared with the outlines of the bones{told}",)
+
+
+def _started_at(scene: Scene, start: Mapping[str, Tensor]) -> Scene:
+    """The scene with objects at these poses (4, 4) at the start."""
+    objects = dict(scene.objects)
+    for name, pose in start.items():
+        if name not in objects:
+            raise InputError(f"start: there is no object {name!r} in this case; there are: {', '.join(objects)}.")
+        objects[name] = replace(objects[name], start=Start(camera1_from=check_rigid(pose.double(), f"start, {name}")))
+    return replace(scene, objects=objects)
+
+
+def _start(
+    case: Case,
+    scene: Scene,
+    plan: Plan,
+    find: Detector | None,
+    landmarks: Mapping[str, Tensor] | None,
+    report: Report,
+) -> tuple[StartRecord, Scene]:
+    """The pose that the objects are placed by, and the scene with what the network sees, if a stage asks for it."""
+    look = find
+    seen = None
+    if plan.needs_segmentations or (scene.needs_landmarks and landmarks is None):
+        if case.anatomy is None and find is None:
+            raise InputError(
+                f"{case.folder}/case.yaml: no network knows the landmarks of {scene.anchor}. Name an `anatomy`, or "
+                "give the landmarks in the image (--landmarks) or a start pose (--start)."
+            )
+        report("finding landmarks", 0.0)
+        look = find or network_detector(case)
+        seen = look(scene.images[scene.first_kind][0], scene.carm.camera)
+    if not scene.needs_landmarks:
+        began = StartRecord(scene.anchor, scene.start().camera1_from[scene.anchor], "poses that were given")
+    elif landmarks is not None:
+        began = start_by_landmarks(case, scene.anchor, landmarks)
+    else:
+        assert seen is not None  # looked at above
+        began = start_by_detection(case, scene, seen)
+    if plan.needs_segmentations and seen is not None and look is not None:
+        scene = with_segmentations(scene, seen, look)
+    return began, scene

@@ -1,16 +1,16 @@
-"""What is registered: volumes of the rigid objects, the fluoroscopic images, and the poses that tie them together."""
+"""What is registered: volumes of the rigid objects, the fluoroscopic images, and where everything starts."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field
 
-import torch
 from torch import Tensor
 
-from femoreg_torch.geometry import Camera, CArm, about_point, exp_se3, transform_points
+from femoreg_torch.case import Start
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import Camera, CArm, Poses, about_point, exp_se3, first_view_only, transform_points
 from femoreg_torch.volume import Volume
 
-Kind = Literal["anatomy", "device"]  # an image without the device, or with it
+Kind = str  # of images: all views have one of each kind; those without and those with the device, say
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,16 +20,24 @@ class RigidObject:
     volume: Volume  # attenuation, 1/mm
     reference_point: Tensor  # (3,) mm: what rotations turn about
     shown_in: tuple[Kind, ...]  # the kinds of images that hold it
-    camera1_from: Tensor | None = None  # (4, 4) nominal start pose; None for what starts where the CT has it
+    start: Start = field(default_factory=Start)  # where the landmarks put it, if nothing else is said
     classes: tuple[int, ...] = ()  # of the segmentation that show it; none for what the network does not know
 
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """What the network sees in the anatomy image of one view."""
+    """What the network sees in the first image of one view."""
 
     probabilities: Tensor  # (C, h, w) of the classes
     camera: Camera  # of their grid, on the detector of the image
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Bones whose outlines, drawn at the start pose, are compared with what the network sees."""
+
+    mask: Volume  # 1 inside
+    bones: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,50 +46,77 @@ class Scene:
 
     carm: CArm
     objects: dict[str, RigidObject]
-    images: dict[Kind, tuple[Tensor, ...]]  # attenuation images (H, W), one per view
+    images: dict[
+        Kind, tuple[Tensor, ...]
+    ]  # attenuation images (H, W), one per view; landmarks are seen in the first kind
     segmentations: tuple[Segmentation, ...] = ()  # one per view; none unless a stage weighs its pixels by them
-    tissue: Volume | None = None  # attenuation of the soft tissue, 1/mm, in the CT's LPS
-    hips: Volume | None = None  # 1 inside the hip bones, in the CT's LPS; None where labels do not tell them apart
+    tissue: Volume | None = None  # attenuation of the soft tissue, 1/mm, in the space of `anchor`
+    outline: Outline | None = None  # what checks the start, in the space of `anchor`
+    camera_from_camera1: Tensor | None = None  # (V, 4, 4) where the C-arm's poses are known and stay; None: to be found
+    missing: tuple[str, ...] = ()  # what the case lacks, in words
+
+    @property
+    def first_kind(self) -> Kind:
+        """The kind of images that landmarks are seen in."""
+        return next(iter(self.images))
 
     @property
     def views(self) -> int:
         """The number of C-arm poses."""
-        return len(self.images["anatomy"])
+        return len(self.images[self.first_kind])
+
+    @property
+    def anchor(self) -> str:
+        """The object that landmarks place; the first one where nothing starts from landmarks."""
+        placed = (name for name, thing in self.objects.items() if thing.start.by_landmarks)
+        return next(placed, next(iter(self.objects)))
+
+    @property
+    def needs_landmarks(self) -> bool:
+        """Whether an object starts where landmarks put it."""
+        return any(thing.start.by_landmarks for thing in self.objects.values())
 
     def shown(self, names: Iterable[str], kind: Kind) -> list[str]:
         """Those of the named objects that images of a kind hold."""
         return [name for name in names if kind in self.objects[name].shown_in]
 
-    def start(self, camera1_from_ct: Tensor) -> "Poses":
-        """Poses at the start of all objects that any image holds, given where the CT lies, (4, 4), in view 1."""
-        placed = {
-            name: camera1_from_ct if thing.camera1_from is None else thing.camera1_from
-            for name, thing in self.objects.items()
-            if any(kind in self.images for kind in thing.shown_in)
-        }
-        return first_view_only(placed, self.views)
+    def start(self, camera1_from_anchor: Tensor | None = None) -> Poses:
+        """Poses at the start of all objects that any image holds, given where landmarks put the anchor, (4, 4).
 
+        Raises `InputError` for an object that starts from landmarks if none are given, or beside one without a place.
+        """
+        placed: dict[str, Tensor] = {}
+        waiting = [name for name, thing in self.objects.items() if any(kind in self.images for kind in thing.shown_in)]
+        while waiting:
+            left = []
+            for name in waiting:
+                where = self._start_of(name, placed, camera1_from_anchor)
+                if where is None:
+                    left.append(name)
+                else:
+                    placed[name] = where
+            if len(left) == len(waiting):
+                raise InputError(
+                    f"object {left[0]}: starts beside {self.objects[left[0]].start.beside!r}, which is nowhere."
+                )
+            waiting = left
+        # in the order of the objects, whichever was placed first
+        poses = first_view_only({name: placed[name] for name in self.objects if name in placed}, self.views)
+        if self.camera_from_camera1 is None:
+            return poses
+        return Poses(self.camera_from_camera1.clone(), poses.camera1_from)
 
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """The moving part. Camera 1 is the frame that everything is tied to."""
-
-    camera_from_camera1: Tensor  # (V, 4, 4); the first is the identity
-    camera1_from: dict[str, Tensor]  # (4, 4) of every object placed so far
-
-    def camera_from(self, name: str) -> Tensor:
-        """Poses (V, 4, 4) of an object in every view."""
-        return self.camera_from_camera1 @ self.camera1_from[name]
-
-    def with_object(self, name: str, camera1_from_object: Tensor) -> "Poses":
-        """The same with one object placed anew."""
-        return replace(self, camera1_from={**self.camera1_from, name: camera1_from_object})
-
-    def with_view(self, view: int, camera_from_camera1: Tensor) -> "Poses":
-        """The same with the C-arm of one view placed anew."""
-        cameras = self.camera_from_camera1.clone()
-        cameras[view] = camera_from_camera1
-        return replace(self, camera_from_camera1=cameras)
+    def _start_of(self, name: str, placed: dict[str, Tensor], camera1_from_anchor: Tensor | None) -> Tensor | None:
+        start = self.objects[name].start
+        if start.camera1_from is not None:
+            return start.camera1_from
+        if start.beside is not None:
+            return placed[start.beside] @ start.beside_from_object if start.beside in placed else None
+        if camera1_from_anchor is None:
+            raise InputError(
+                f"object {name}: starts from landmarks, and none are known. Give landmarks or a start pose."
+            )
+        return camera1_from_anchor
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +163,3 @@ def moved(poses: Poses, bodies: tuple[Body, ...], delta: Tensor) -> Poses:
         for name in body.objects:
             poses = poses.with_object(name, motion @ poses.camera1_from[name])
     return poses
-
-
-def first_view_only(camera1_from: dict[str, Tensor], views: int) -> Poses:
-    """Poses at the start: every C-arm stands where the first one does until it is found."""
-    return Poses(torch.eye(4, dtype=torch.float64).repeat(views, 1, 1), dict(camera1_from))

@@ -1,6 +1,6 @@
-"""The start pose made better, and checked: hip bones drawn where PnP puts them, against where the network sees them.
+"""The start pose made better, and checked: bones drawn where PnP puts them, against where the network sees them.
 
-A few landmarks of one hip leave the rotation open by ten degrees and more; the outline of the bone does not. The pose
+A few landmarks of one bone leave the rotation open by ten degrees and more; the outline of the bone does not. The pose
 is the most probable one given PnP's pose with its covariance, and the network's segmentation.
 """
 
@@ -10,48 +10,52 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from femoreg_torch.anatomy import Anatomy
 from femoreg_torch.detect import to_network_grid
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, about_point, exp_se3
-from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective, minimise
-from femoreg_torch.registration.scene import Segmentation
+from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective
+from femoreg_torch.registration.scene import Outline, Segmentation
 from femoreg_torch.registration.weights import dilated
-from femoreg_torch.volume import Volume, resample_isotropic
+from femoreg_torch.volume import BoneLabels, resample_isotropic
 
-HIP_CLASSES, FEMUR_CLASSES = (1, 2), (5, 6)  # of the network's segmentation
 _SPACING_MM = 2.5  # of the mask and of the steps through it
 _OPAQUE_MM = 2.0  # path in bone after which a pixel is labelled with probability 1 − 1/e; labels begin at 1.5 mm
 # Standard deviation of a pixel's probability, as if pixels were independent; chosen on procedural patient 101, with the
 # band. Pixels of one outline err together, so it is far greater than that of one pixel.
 _PIXEL_DEVIATION = 1.0
 _BAND_MM = 15.0  # on the detector, about the bone that is seen; further off a shutter may hide what is drawn
-_FEMUR_MARGIN_MM = 3.0
+_HIDDEN_MARGIN_MM = 3.0
 _STEP = 1e-3  # of a twist in standard deviations, for derivatives
 _SEARCH = LevenbergMarquardt(max_iterations=15, tol_x=0.02, tol_f=0.01, candidates=60, starts=3)
 
 
 @dataclass(frozen=True)
 class SilhouetteFit:
-    """A pose, and how far the hip bones drawn there cover those seen."""
+    """A pose, and how far the bones drawn there cover those seen."""
 
     camera_from_ct: Tensor  # (4, 4) float64
     overlap: float  # Dice in the band about the bone that is seen
     covariance: Tensor  # (6, 6) of (rotation in rad, translation in mm), camera axes, about the centre given
 
 
-def hip_mask(labels: Volume, pelvis_ids: tuple[int, ...]) -> Volume | None:
-    """Both hip bones of a label map, 1 inside, on coarse voxels; None unless they are labels 1 and 2 of the pelvis.
+def outline_of(bones: BoneLabels, anatomy: Anatomy | None) -> Outline | None:
+    """Those bones of a label map that the anatomy compares outlines by, on coarse voxels.
 
-    A pelvis of one label cannot be compared with a segmentation that tells hip bones and sacrum apart.
+    None where the map tells none of them apart from others: a pelvis in one label cannot be compared with a
+    segmentation that tells hip bones and sacrum apart.
     """
-    if not set(HIP_CLASSES) <= set(pelvis_ids):
+    told = tuple(bone for bone in anatomy.outline if bone in bones.ids) if anatomy else ()
+    if not told:
         return None
-    inside = torch.isin(labels.data, torch.tensor(HIP_CLASSES, dtype=labels.data.dtype)).to(torch.float32)
-    return resample_isotropic(labels.with_data(inside), _SPACING_MM)
+    ids = torch.tensor(bones.of(told, anatomy), dtype=bones.labels.data.dtype)
+    inside = torch.isin(bones.labels.data, ids).to(torch.float32)
+    return Outline(resample_isotropic(bones.labels.with_data(inside), _SPACING_MM), told)
 
 
 def refine_by_silhouette(
-    hips: Volume,
+    outline: Outline,
+    anatomy: Anatomy,
     camera_from_ct: Tensor,
     centre: Tensor,
     covariance: Tensor,
@@ -59,21 +63,21 @@ def refine_by_silhouette(
     attenuation: Tensor,
     camera: Camera,
 ) -> SilhouetteFit:
-    """The pose near `camera_from_ct` (4, 4) whose hip bones cover those of the segmentation.
+    """The pose near `camera_from_ct` (4, 4) where the bones of `outline` cover those of the segmentation.
 
     `covariance` (6, 6) of the start is about `centre` (3,), mm in the camera frame. `attenuation` (H, W) of `camera` is
-    the image; where it stands at its least or greatest value (shutters, saturation) nothing is compared. Femora hide
-    hip bones in the segmentation, so that neither is compared there.
+    the image; where it stands at its least or greatest value (shutters, saturation) nothing is compared, nor where the
+    segmentation sees bones that may hide those of the outline.
     """
-    looked_at = _looked_at(seen, attenuation, camera)
-    target = seen.probabilities[list(HIP_CLASSES)].sum(0)[looked_at].double()
+    looked_at = _looked_at(seen, outline, anatomy, attenuation, camera)
+    target = seen.probabilities[list(anatomy.classes(outline.bones))].sum(0)[looked_at].double()
     root = torch.linalg.cholesky(covariance.double())  # twist = root · u, with u of unit variance
 
     def poses(units: Tensor) -> Tensor:
         return about_point(exp_se3(units @ root.T), centre) @ camera_from_ct
 
     def drawn(units: Tensor) -> Tensor:
-        lengths = project([hips], poses(units)[:, None], seen.camera, _SPACING_MM)
+        lengths = project([outline.mask], poses(units)[:, None], seen.camera, _SPACING_MM)
         return 1 - torch.exp(-lengths[:, looked_at].double() / _OPAQUE_MM)
 
     def values(units: Tensor) -> Tensor:
@@ -88,7 +92,7 @@ def refine_by_silhouette(
         value = 0.5 * float(misfit @ misfit + unit @ unit)
         return Quadratic(value, (slopes @ misfit + unit)[None], slopes @ slopes.T + torch.eye(6, dtype=torch.float64))
 
-    best = minimise(SmoothObjective(values, quadratic), 6, _SEARCH, seed=0).delta
+    best = _SEARCH.minimise(SmoothObjective(values, quadratic), 6, seed=0).delta
     inside = drawn(best[None])[0] > 0.5
     bone = target > 0.5
     overlap = 2 * float((inside & bone).sum()) / max(float(inside.sum() + bone.sum()), 1.0)
@@ -96,12 +100,15 @@ def refine_by_silhouette(
     return SilhouetteFit(poses(best[None])[0], overlap, posterior)
 
 
-def _looked_at(seen: Segmentation, attenuation: Tensor, camera: Camera) -> Tensor:
+def _looked_at(seen: Segmentation, outline: Outline, anatomy: Anatomy, attenuation: Tensor, camera: Camera) -> Tensor:
     """Pixels (h, w) of the segmentation's grid that are compared."""
-    hips, femora = (seen.probabilities[list(classes)].sum(0) > 0.5 for classes in (HIP_CLASSES, FEMUR_CLASSES))
-    near = dilated(hips, _BAND_MM, seen.camera)
-    hidden = dilated(femora, _FEMUR_MARGIN_MM, seen.camera)
+    others = (*anatomy.hides_outline, *(bone for bone in anatomy.outline if bone not in outline.bones))
+    compared, hiding = (
+        seen.probabilities[list(anatomy.classes(bones))].sum(0) > 0.5 for bones in (outline.bones, others)
+    )
+    near = dilated(compared, _BAND_MM, seen.camera)
+    hidden = dilated(hiding, _HIDDEN_MARGIN_MM, seen.camera)
     low, high = attenuation.aminmax()
     extreme = to_network_grid(((attenuation <= low) | (attenuation >= high)).float(), camera)
     covered = F.interpolate(extreme[None, None], seen.camera.shape, mode="area")[0, 0] > 0.5
-    return near & ~hidden & ~dilated(covered, _FEMUR_MARGIN_MM, seen.camera)
+    return near & ~hidden & ~dilated(covered, _HIDDEN_MARGIN_MM, seen.camera)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +10,11 @@ import pytest
 import torch
 import yaml
 
-from femoreg_torch.case import Case, Device, Truth, View, read_case, read_result, write_case, write_json
+from femoreg_torch.anatomy import HIP, label_table
+from femoreg_torch.case import Case, Model, PlannedPath, View, read_case, write_case, write_json
+from femoreg_torch.case.femoroplasty import Device, device_of, femoroplasty_objects, planned, with_device
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import CArm, centred_camera, exp_se3, load_carm
-from femoreg_torch.volume import HIP_LANDMARKS
+from femoreg_torch.geometry import CArm, centred_camera, exp_se3, load_carm, poses_by_object
 
 FILES = ("ct.nii.gz", "labels.nii.gz", "device.stl", "view1.tif", "view1_device.tif", "view2.tif")
 
@@ -27,24 +28,26 @@ def example(folder: Path) -> Case:
     for name in FILES:
         (folder / name).touch()
     points = torch.randn(18, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 100
-    landmarks = dict(zip(HIP_LANDMARKS, points, strict=False))
+    landmarks = dict(zip(HIP.landmark_names, points, strict=False))
     device_points = dict(zip(("tip", "base", "center"), points[15:], strict=True))
+    device = Device(Model(folder / "device.stl", 5000.0), device_points, pose(1))
     return Case(
         folder=folder,
-        side="left",
+        carm=load_carm("cios_fusion"),
+        objects=femoroplasty_objects("left", landmarks["FH-l"], device),
+        views=(
+            View({"anatomy": folder / "view1.tif", "device": folder / "view1_device.tif"}),
+            View({"anatomy": folder / "view2.tif"}, intensity="log"),
+        ),
+        anatomy=HIP,
         ct_path=folder / "ct.nii.gz",
         labels_path=folder / "labels.nii.gz",
-        structures={"pelvis": (1, 2, 4), "femur_left": (5,), "femur_right": (6,)},
+        bones=label_table("totalsegmentator_v2"),
         landmarks=landmarks,
-        entry_point=points[14],
-        target=landmarks["FH-l"],
-        device=Device(folder / "device.stl", 5000.0, device_points, pose(1)),
-        carm=load_carm("cios_fusion"),
-        views=(
-            View(folder / "view1.tif", folder / "view1_device.tif"),
-            View(folder / "view2.tif", intensity="log"),
-        ),
-        truth=Truth(torch.stack([pose(2), pose(3)]), pose(4), pose(5)),
+        plan=planned("left", points[14], landmarks["FH-l"], device),
+        truth=poses_by_object(torch.stack([pose(2), pose(3)]), "pelvis", {"femur": pose(4), "device": pose(5)}),
+        template="femoroplasty",
+        side="left",
     )
 
 
@@ -52,14 +55,18 @@ def assert_same(a: Any, b: Any) -> None:
     """Equal dataclasses, mappings and values, tensors to the decimals that are written."""
     if isinstance(a, torch.Tensor):
         assert a.dtype == b.dtype == torch.float64
-        torch.testing.assert_close(a, b, atol=1e-8, rtol=0)
-    elif isinstance(a, Case | Device | Truth):
+        torch.testing.assert_close(a, b, atol=1e-7, rtol=0)
+    elif is_dataclass(a):
         for name in vars(a):
             assert_same(getattr(a, name), getattr(b, name))
     elif isinstance(a, dict):
         assert list(a) == list(b)
         for key in a:
             assert_same(a[key], b[key])
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for one, other in zip(a, b, strict=True):
+            assert_same(one, other)
     else:
         assert a == b
 
@@ -77,20 +84,38 @@ def test_a_written_case_comes_back(tmp_path: Path) -> None:
 def test_a_case_without_what_is_optional_comes_back(tmp_path: Path) -> None:
     carm = CArm(centred_camera(1000.0, (0.3, 0.4), (800, 900)), (0.0, 1.0, 600.0), (0.0, 1.0, 0.0))
     target = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    bare = {"labels_path": None, "structures": {}, "device": None, "views": (), "truth": None}
-    case = replace(example(tmp_path), side="right", target=target, carm=carm, **bare)
+    whole = example(tmp_path)
+    case = replace(
+        whole,
+        side="right",
+        carm=carm,
+        objects=femoroplasty_objects("right", whole.landmarks["FH-r"], None),
+        plan=PlannedPath("femur", target + 50, target),
+        labels_path=None,
+        bones={},
+        views=(),
+        truth=None,
+    )
     write_case(tmp_path, case)
     assert_same(read_case(tmp_path), case)
+
+
+def test_the_poses_of_a_biplane_come_back(tmp_path: Path) -> None:
+    case = example(tmp_path)
+    views = (case.views[0], replace(case.views[1], camera_from_camera1=pose(9)))
+    write_case(tmp_path, replace(case, views=views))
+    assert_same(read_case(tmp_path).views, views)
 
 
 @pytest.mark.parametrize(("hu", "labels"), [(5000.0, (3, 7)), (None, None)])
 def test_a_device_as_a_volume_comes_back(tmp_path: Path, hu: float | None, labels: tuple[int, ...] | None) -> None:
     case = example(tmp_path)
-    assert case.device is not None
     (tmp_path / "device.nrrd").touch()
-    device = replace(case.device, model_path=tmp_path / "device.nrrd", hu=hu, labels=labels)
-    write_case(tmp_path, replace(case, device=device))
-    assert_same(read_case(tmp_path).device, device)
+    device = device_of(case)
+    assert device is not None
+    device = replace(device, model=Model(tmp_path / "device.nrrd", hu, labels))
+    write_case(tmp_path, with_device(case, device))
+    assert_same(device_of(read_case(tmp_path)), device)
     written = yaml.safe_load((tmp_path / "case.yaml").read_text())["device"]
     assert ("model" in written, written["volume"]) == (False, "device.nrrd")
 
@@ -103,14 +128,23 @@ def test_files_outside_the_folder_are_found_from_it(tmp_path: Path) -> None:
     assert read_case(tmp_path / "made").ct_path.samefile(tmp_path / "ct.nii.gz")
 
 
-def test_names_that_follow_the_side(tmp_path: Path) -> None:
-    case = replace(example(tmp_path), side="right")
-    assert case.femur == "femur_right"
-    assert torch.equal(case.femoral_head, case.landmarks["FH-r"])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_operated_femur_follows_the_side(tmp_path: Path, side: str) -> None:
+    write_case(tmp_path, example(tmp_path))
+    text = (tmp_path / "case.yaml").read_text().replace("side: left", f"side: {side}")
+    (tmp_path / "case.yaml").write_text(text)
+    case = read_case(tmp_path)
+    assert case.objects["femur"].bones == (f"femur_{side}",)
+    head = case.objects["femur"].reference
+    assert head is not None
+    assert torch.equal(head, case.landmarks[f"FH-{side[0]}"])
+    assert case.objects["femur"].start.beside == "pelvis"
 
 
 Change = Callable[[dict[str, Any]], object]
 SCALED = [[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1]]
+EYE = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1]]
+SHIFTED = [[1.0, 0, 0, 5.0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1]]
 MIRRORED = [[-1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1]]
 
 
@@ -124,7 +158,10 @@ BAD: list[tuple[Change, str]] = [
     (lambda c: c.update(sied="left"), r"case\.yaml, sied: unknown key"),
     (lambda c: c.pop("side"), r"case\.yaml, side: is missing, left or right"),
     (lambda c: c.update(side="both"), r"case\.yaml, side: left or right was expected, found 'both'"),
-    (lambda c: c.update(version=2), r"case\.yaml, version: .* found 2"),
+    (lambda c: c.update(version=3), r"case\.yaml, version: .* found 3"),
+    (lambda c: c.update(version=True), r"case\.yaml, version: .* found True"),
+    (lambda c: c.update(template="knee"), r"case\.yaml, template: femoroplasty was expected, found 'knee'"),
+    (lambda c: c.pop("template"), r"case\.yaml, side: unknown key"),
     (lambda c: c.pop("version"), r"case\.yaml, version: is missing"),
     (lambda c: c.pop("ct"), r"case\.yaml, ct: is missing"),
     (lambda c: c.update(ct="ct.nii.gz"), r"case\.yaml, ct: a mapping"),
@@ -133,12 +170,13 @@ BAD: list[tuple[Change, str]] = [
     (lambda c: c["ct"].update(image=3), r"ct\.image: the path of a file was expected, found 3"),
     (lambda c: c["ct"].update(labels="no.nii.gz"), r"ct\.labels: there is no file"),
     (lambda c: c["ct"].update(label="a"), r"ct\.label: unknown key"),
-    (lambda c: c["ct"].pop("structures"), r"ct\.structures: is missing"),
-    (lambda c: c["ct"]["structures"].update(tibia=[7]), r"ct\.structures\.tibia: unknown key"),
-    (lambda c: c["ct"]["structures"].pop("femur_left"), r"ct\.structures\.femur_left: is missing"),
-    (lambda c: c["ct"]["structures"].update(pelvis=1), r"ct\.structures\.pelvis: a list of label ids"),
-    (lambda c: c["ct"]["structures"].update(pelvis=[0]), r"ct\.structures\.pelvis: a list of label ids"),
-    (lambda c: c["ct"]["structures"].update(pelvis=[1, 5]), r"structures\.femur_left: label 5 belongs to pelvis"),
+    (lambda c: c["ct"].pop("bones"), r"ct\.bones: missing. Name the table"),
+    (lambda c: c["ct"].update(bones="totalsegmentor"), r"ct\.bones: no anatomy/labels preset .*totalsegmentator_v2"),
+    (lambda c: c["ct"].update(bones=["pelvis"]), r"ct\.bones: the name of a table or .* found list"),
+    (lambda c: c["ct"].update(bones={"tibia": 7}), r"ct\.bones: anatomy hip: there is no bone 'tibia'"),
+    (lambda c: c["ct"].update(bones={"pelvis": 7}), r"ct\.bones: has no id of the femur_left"),
+    (lambda c: c["ct"].update(bones={"pelvis": 0}), r"ct\.bones\.pelvis: a label id above 0"),
+    (lambda c: c["ct"].update(bones={"pelvis": 1, "femur_left": [2, 1]}), r"femur_left: label 1 belongs to pelvis"),
     (lambda c: c.update(landmarks="no.json"), r"case\.yaml, landmarks: there is no file"),
     (lambda c: c["plan"].pop("entry_point"), r"plan\.entry_point: is missing, a point"),
     (lambda c: c["plan"].update(entry_point=[1, 2]), r"plan\.entry_point: a point \[x, y, z\] in mm"),
@@ -148,6 +186,7 @@ BAD: list[tuple[Change, str]] = [
     (lambda c: c["plan"].update(target="head"), r"plan\.target: one of FH, GSN"),
     (lambda c: c["plan"].update(target="ASIS"), r"plan\.target: landmark ASIS-l is not in the landmark file"),
     (lambda c: c["plan"].update(target=7), r"plan\.target: a point"),
+    (lambda c: c["plan"].update(entry_point=[1, 2, 3], target=[1, 2, 3]), r"plan\.entry_point: is the target itself"),
     (lambda c: c["device"].pop("hu"), r"device\.hu: is missing"),
     (lambda c: c["device"].update(hu="steel"), r"device\.hu: a number was expected, found 'steel'"),
     (lambda c: c["device"].update(hu=True), r"device\.hu: a number was expected"),
@@ -158,8 +197,8 @@ BAD: list[tuple[Change, str]] = [
     (lambda c: c["device"].update(labels=[1]), r"device\.labels: only a `volume` has labels"),
     (lambda c: as_volume(c, "device.stl", labels=[1]), r"device\.volume: a volume .*device\.stl.*`model`"),
     (lambda c: as_volume(c, "no.nrrd", labels=[1]), r"device\.volume: there is no file"),
-    (lambda c: as_volume(c, "labels.nii.gz", labels=[0]), r"device\.labels: a list of label ids .*found \[0\]"),
-    (lambda c: as_volume(c, "labels.nii.gz", labels=3), r"device\.labels: a list of label ids .*found 3"),
+    (lambda c: as_volume(c, "labels.nii.gz", labels=[0]), r"device\.labels: a label id above 0.*found \[0\]"),
+    (lambda c: as_volume(c, "labels.nii.gz", labels="all"), r"device\.labels: a label id above 0.*found all"),
     (lambda c: as_volume(c, "labels.nii.gz", labels=[1], hu=None), r"device\.hu: is missing"),
     (lambda c: as_volume(c, "labels.nii.gz"), r"device\.hu: a `volume` without `labels` holds HU"),
     (lambda c: c["device"]["points"].pop("base"), r"device\.points\.base: is missing"),
@@ -178,6 +217,9 @@ BAD: list[tuple[Change, str]] = [
     (lambda c: c["views"][0].update(device="no.tif"), r"case\.yaml, views\[0\]\.device: there is no file"),
     (lambda c: c["views"][0].update(intensity="bright"), r"case\.yaml, views\[0\]\.intensity: raw or log"),
     (lambda c: c["views"][0].update(image="view1.tif"), r"case\.yaml, views\[0\]\.image: unknown key"),
+    (lambda c: c["views"][0].update(camera_from_camera1=SCALED), r"views\[0\]\.camera_from_camera1: not a rigid"),
+    (lambda c: c["views"][0].update(camera_from_camera1=SHIFTED), r"camera_from_camera1: the first view is camera 1"),
+    (lambda c: c["views"][0].update(camera_from_camera1=EYE), r"views\[1\]\.camera_from_camera1: missing, while"),
     (lambda c: c["views"].pop(), r"truth\.json, camera_from_pelvis: 2 poses, but the case has 1 views"),
     (lambda c: c.update(truth="no.json"), r"case\.yaml, truth: there is no file"),
 ]  # fmt: skip
@@ -232,43 +274,3 @@ def test_what_is_no_case(tmp_path: Path, content: bytes | None, message: str) ->
     with pytest.raises(InputError, match=message) as raised:
         read_case(tmp_path)
     assert "\n" not in str(raised.value)
-
-
-def result() -> dict[str, Any]:
-    return {
-        "camera_from_pelvis": torch.stack([pose(1), pose(2)]),
-        "camera1_from_femur": pose(3),
-        "camera1_from_device": pose(4),
-        "femur_from_device": pose(5),
-        "points_camera1": {"entry_point": torch.ones(3), "tip": torch.zeros(3)},
-        "directions_camera1": {"path": torch.tensor([0.0, 0.0, 1.0])},
-        "preset": "paper",
-        "seed": 3,
-    }
-
-
-def test_a_result_comes_back_as_tensors(tmp_path: Path) -> None:
-    write_json(tmp_path / "result.json", result())
-    again = read_result(tmp_path)
-    for name in ("camera_from_pelvis", "camera1_from_femur", "camera1_from_device", "femur_from_device"):
-        torch.testing.assert_close(again[name], result()[name], atol=1e-8, rtol=0)
-    assert again["points_camera1"]["entry_point"].tolist() == [1, 1, 1]
-    assert again["directions_camera1"]["path"].dtype == torch.float64
-    assert (again["preset"], again["seed"]) == ("paper", 3)
-
-
-def test_a_result_without_a_device_comes_back(tmp_path: Path) -> None:
-    bare = {key: value for key, value in result().items() if "device" not in key} | {"camera1_from_device": None}
-    write_json(tmp_path / "result.json", bare)
-    assert read_result(tmp_path)["camera1_from_device"] is None
-
-
-@pytest.mark.parametrize(
-    "change", [{"camera1_from_femur": SCALED}, {"camera_from_pelvis": None}, {"points_camera1": 3}]
-)
-def test_bad_results(tmp_path: Path, change: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=r"result\.json"):
-        read_result(tmp_path)
-    write_json(tmp_path / "result.json", result() | change)
-    with pytest.raises(InputError, match=next(iter(change))):
-        read_result(tmp_path)

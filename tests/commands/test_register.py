@@ -12,8 +12,8 @@ import tifffile
 import trimesh
 import yaml
 
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.commands.main import main
-from femoreg_torch.volume import HIP_LANDMARKS
 
 SIZE = 64
 POSE = [[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 700], [0, 0, 0, 1]]
@@ -59,7 +59,7 @@ def case(tmp_path: Path) -> Path:
     ct[:, :2] = -1000  # air in front
     write_grid(folder / "ct.nii.gz", ct)
     write_grid(folder / "labels.nii.gz", labels)
-    points = {name: [float(10 * i - 60), 0.0, float(5 * i - 40)] for i, name in enumerate(HIP_LANDMARKS)}
+    points = {name: [float(10 * i - 60), 0.0, float(5 * i - 40)] for i, name in enumerate(HIP.landmark_names)}
     text = {"space": "LPS", "unit": "mm", "landmarks": points}
     (folder / "landmarks.json").write_text(json.dumps(text), encoding="utf-8")
     trimesh.creation.box((10, 12, 40)).export(folder / "device.stl")
@@ -143,7 +143,7 @@ def no_landmarks_to_see(_folder: Path) -> None:
         (constant_image, "view1.tif"),
         (scaled_pose, "camera1_from_device"),
         (open_device, "device.stl"),
-        (absent_structure, "[9]"),
+        (absent_structure, "no voxel carries the label 9, the pelvis"),
         (no_landmarks_to_see, "usable landmarks"),
     ],
 )
@@ -177,5 +177,5 @@ def test_a_bad_calibration_of_the_robot_is_refused_before_the_work_begins(
     robot.write_text("base_from_device\n1 0 0 900\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
     change_yaml(case, lambda c: c.pop("device"))
     assert main(["register", str(case), "--out", str(run), "--robot", str(robot)]) == 2
-    assert "no device to steer" in capfd.readouterr().err
+    assert "no tool to steer" in capfd.readouterr().err
     assert not run.exists()

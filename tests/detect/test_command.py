@@ -1,6 +1,8 @@
 """`femoreg detect`: what it writes, and that bad input leaves nothing behind."""
 
 import csv
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -9,57 +11,88 @@ import SimpleITK as sitk
 import torch
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import DigitalXRayImageStorageForPresentation, ExplicitVRLittleEndian, generate_uid
+from torch import Tensor, nn
+from torch.nn import functional as F
 
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.commands.detect import detect
-from femoreg_torch.detect import looks, network
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import read_image, write_image
-from femoreg_torch.volume import HIP_LANDMARKS, read_landmarks
-from models.unet import UNet, UNetConfig
-from models.weights import save_weights
+from femoreg_torch.volume import read_landmarks
+from models.kinds import NETWORKS
+from models.protocols import Prediction
+from models.weights import Weights, save_weights
+
+SPOT = (1000.0, 400.0)  # column and row of the brightest place of `image`
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny untrained network whose heat maps all peak sharply somewhere."""
-    torch.manual_seed(2)
-    tiny = UNet(UNetConfig(channels=(8, 12, 16), convolutions=(1, 1, 1)))
-    torch.nn.init.constant_(tiny.absence.bias, -50.0)
-    with torch.no_grad():
-        tiny.heatmaps.weight *= 200
-    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    save_weights(path, tiny, {})
-    return path
+class BrightestPlace(nn.Module):
+    """Every landmark is where the image is brightest."""
+
+    def __init__(self, classes: int, landmarks: int, absence: float) -> None:
+        super().__init__()
+        self.counts = (classes, landmarks)
+        self.register_buffer("absence", torch.tensor(absence))
+
+    def forward(self, images: Tensor) -> Prediction:
+        small = F.avg_pool2d(images, 2)
+        classes, landmarks = self.counts
+        logits = small - small.amax((2, 3), keepdim=True)  # the spot is 14 deviations bright
+        absence = self.absence.expand(len(images), landmarks)
+        return Prediction(small.new_zeros(len(images), classes, 96, 96), logits.expand(-1, landmarks, -1, -1), absence)
+
+
+@dataclass(frozen=True)
+class BrightestPlaceSettings:
+    classes: int
+    landmarks: int
+
+    def build(self) -> nn.Module:
+        return BrightestPlace(self.classes, self.landmarks, 0.0)
+
+
+@pytest.fixture
+def weights_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], Path]:
+    """Writes weights of a network that finds the brightest place, or, with an `absence` far above 0, nothing."""
+    monkeypatch.setitem(NETWORKS, "brightest_place", BrightestPlaceSettings)
+    counts = {"classes": 1 + len(HIP.bones), "landmarks": len(HIP.landmarks)}
+
+    def write(absence: float) -> Path:
+        state = BrightestPlace(*counts.values(), absence).state_dict()
+        path = tmp_path / "weights.safetensors"
+        save_weights(path, Weights("brightest_place", counts, HIP.name, 1.25, state), {})
+        return path
+
+    return write
+
+
+@pytest.fixture
+def weights(weights_of: Callable[[float], Path]) -> Path:
+    return weights_of(-50.0)
 
 
 @pytest.fixture(scope="module")
 def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("images")
-    raw = torch.rand((24, 24), generator=torch.Generator().manual_seed(1)).repeat_interleave(64, 0)
-    raw = raw.repeat_interleave(64, 1) * 30000 + 5000
-    path = folder / "view1.tif"
+    """A raw picture with one dark spot, which is the brightest place of its attenuation."""
+    axis = torch.arange(1536.0)
+    squares = (axis - SPOT[0]) ** 2 + (axis[:, None] - SPOT[1]) ** 2
+    raw = 30000 * torch.exp(-2.0 * torch.exp(-squares / (2 * 60.0**2)))
+    path = tmp_path_factory.mktemp("images") / "view1.tif"
     write_image(path, raw.to(torch.uint16))
     return path
 
 
-@pytest.fixture
-def one_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Several looks agree on what a trained network sees; this one sees something else each time."""
-    plainly = looks.read_image
-    monkeypatch.setattr(network, "read_image", lambda net, image, _looks: plainly(net, image, looks.PLAIN))
-
-
-@pytest.mark.usefixtures("one_look")
 def test_writes_table_markups_and_picture(image: Path, weights: Path, tmp_path: Path) -> None:
     detect([image], out=tmp_path / "out", weights=weights)
     with (tmp_path / "out" / "landmarks.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["image", "landmark", "column_px", "row_px", "confidence", "visible"]
-    assert [row["landmark"] for row in rows] == list(HIP_LANDMARKS)
+    assert [row["landmark"] for row in rows] == list(HIP.landmark_names)
     assert {row["image"] for row in rows} == {str(image)}
     seen = {row["landmark"]: row for row in rows if row["visible"] == "1"}
-    assert seen
-    assert all(-0.5 <= float(row["column_px"]) <= 1535.5 for row in seen.values())
+    assert list(seen) == list(HIP.landmark_names)
+    for row in seen.values():
+        assert (float(row["column_px"]), float(row["row_px"])) == pytest.approx(SPOT, abs=2.0)
     points = read_landmarks(tmp_path / "out" / "view1.mrk.json")
     assert set(points) == set(seen)
     for name, point in points.items():
@@ -91,7 +124,6 @@ def test_bad_input_leaves_nothing_behind(image: Path, weights: Path, tmp_path: P
     assert not out.exists()
 
 
-@pytest.mark.usefixtures("one_look")
 def test_a_folder_of_images_in_every_format(image: Path, weights: Path, tmp_path: Path) -> None:
     """The same picture as PNG, TIFF, NIfTI and DICOM gives the same landmarks."""
     raw = read_image(image)
@@ -104,20 +136,20 @@ def test_a_folder_of_images_in_every_format(image: Path, weights: Path, tmp_path
     detect([folder], out=tmp_path / "out", weights=weights)
     with (tmp_path / "out" / "landmarks.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 4 * 14
-    assert [row["image"] for row in rows[::14]] == [str(folder / name) for name in ("a.png", "b.tif", "c.nii.gz", "d")]
-    for n in range(14):
-        assert len({(row["column_px"], row["row_px"], row["confidence"]) for row in rows[n::14]}) == 1
+    count = len(HIP.landmarks)
+    assert [row["image"] for row in rows[::count]] == [str(folder / n) for n in ("a.png", "b.tif", "c.nii.gz", "d")]
+    assert len(rows) == 4 * count
+    for n in range(count):
+        assert len({(row["column_px"], row["row_px"], row["confidence"]) for row in rows[n::count]}) == 1
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="a folder without files"):
         detect([tmp_path / "empty"], out=tmp_path / "out2", weights=weights)
 
 
-def test_too_few_landmarks_are_said(image: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tiny = UNet(UNetConfig(channels=(8, 12, 16), convolutions=(1, 1, 1)))
-    torch.nn.init.constant_(tiny.absence.bias, 50.0)
-    save_weights(tmp_path / "blind.safetensors", tiny, {})
-    detect([image], out=tmp_path / "out", weights=tmp_path / "blind.safetensors")
+def test_too_few_landmarks_are_said(
+    image: Path, weights_of: Callable[[float], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    detect([image], out=tmp_path / "out", weights=weights_of(50.0))
     said = " ".join(capsys.readouterr().out.split())
     assert "0 of 14 landmarks, not enough landmarks for a start pose, which takes 4" in said
 

@@ -1,15 +1,14 @@
 """Equations 5 to 13 against numbers worked out by hand."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
-from femoreg_torch.case import Truth
+from femoreg_torch.case import PlannedPath
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import ReferencePoints, errors
-from femoreg_torch.geometry import exp_so3, rigid
+from femoreg_torch.geometry import Poses, exp_so3, poses_by_object, rigid
 
 
 def vector(*values):
@@ -22,12 +21,21 @@ def shifted(pose, x=0.0, y=0.0, z=0.0):
 
 
 POINTS = ReferencePoints(
-    pelvis=vector(0, 10, 20),
-    femoral_head=vector(90, 0, 0),
-    entry_point=vector(90, 0, -50),
-    target=vector(90, 0, 0),
-    device={"center": vector(0, 0, 50), "tip": vector(0, 0, 100), "base": vector(0, 0, 0)},
+    objects={"pelvis": vector(0, 10, 20), "femur": vector(90, 0, 0), "device": vector(0, 0, 50)},
+    plan=PlannedPath("femur", entry_point=vector(90, 0, -50), target=vector(90, 0, 0), tool="device"),
+    guide=(vector(0, 0, 0), vector(0, 0, 100)),
 )
+
+
+def without(poses, name):
+    """The same poses but for one object."""
+    return Poses(poses.camera_from_camera1, {n: pose for n, pose in poses.camera1_from.items() if n != name})
+
+
+def seen_in_views(poses, camera_from_pelvis):
+    """The same poses, with the C-arm where it sees the pelvis so."""
+    others = {name: pose for name, pose in poses.camera1_from.items() if name != "pelvis"}
+    return poses_by_object(camera_from_pelvis, "pelvis", others)
 
 
 @pytest.fixture
@@ -37,7 +45,8 @@ def truth():
         [pelvis, *(rigid(exp_so3(vector(0, a, 0)), vector(30 * a, 2, 5)) @ pelvis for a in (0.2, -0.3))]
     )
     femur = pelvis @ rigid(exp_so3(vector(0.1, 0, 0)))
-    return Truth(views, femur, rigid(exp_so3(vector(0, 1.2, 0)), vector(0, 0, 560)))
+    device = rigid(exp_so3(vector(0, 1.2, 0)), vector(0, 0, 560))
+    return poses_by_object(views, "pelvis", {"femur": femur, "device": device})
 
 
 def test_a_perfect_estimate_has_no_error(truth):
@@ -59,7 +68,7 @@ def test_a_perfect_estimate_has_no_error(truth):
 )
 def test_shifts_along_the_camera_axes_land_in_lr_is_and_ap(truth, camera_shift, expected):
     """Camera x is patient left (LR), camera y is down, away from the head (−IS), camera z is depth (AP)."""
-    estimate = replace(truth, camera1_from_femur=shifted(truth.camera1_from_femur, *camera_shift))
+    estimate = truth.with_object("femur", shifted(truth.camera1_from["femur"], *camera_shift))
     found = errors(truth, estimate, POINTS)
     assert found["femur"]["mm"] == pytest.approx(1)
     assert found["femur"]["mm_xyz"] == pytest.approx(expected, abs=1e-9)
@@ -71,9 +80,9 @@ def test_shifts_along_the_camera_axes_land_in_lr_is_and_ap(truth, camera_shift, 
 
 def test_a_rotation_about_the_head_moves_the_entry_point_by_the_chord(truth):
     """2° in LPS about the left-right axis through the head: the entry point 50 mm below it moves by 2 · 50 · sin 1°."""
-    head = POINTS.femoral_head
+    head = POINTS.objects["femur"]
     turn = rigid(translation=head) @ rigid(exp_so3(vector(math.radians(2), 0, 0))) @ rigid(translation=-head)
-    found = errors(truth, replace(truth, camera1_from_femur=truth.camera1_from_femur @ turn), POINTS)
+    found = errors(truth, truth.with_object("femur", truth.camera1_from["femur"] @ turn), POINTS)
     assert found["femur"]["mm"] == pytest.approx(0, abs=1e-9)
     assert found["femur"]["deg"] == pytest.approx(2)
     assert found["femur"]["deg_xyz"] == pytest.approx([0, 2, 0], abs=1e-6)
@@ -83,17 +92,15 @@ def test_a_rotation_about_the_head_moves_the_entry_point_by_the_chord(truth):
 
 def test_a_turn_about_the_guide_leaves_tip_and_direction(truth):
     about_guide = rigid(exp_so3(vector(0, 0, math.radians(3))))
-    found = errors(truth, replace(truth, camera1_from_device=truth.camera1_from_device @ about_guide), POINTS)
+    found = errors(truth, truth.with_object("device", truth.camera1_from["device"] @ about_guide), POINTS)
     assert found["device"]["deg"] == pytest.approx(3)
     assert found["tip_mm"] == pytest.approx(0, abs=1e-9)
     assert found["guide_deg"] == pytest.approx(0, abs=1e-9)
 
 
 def test_equal_shifts_of_femur_and_device_cancel_in_the_relative_error(truth):
-    estimate = replace(
-        truth,
-        camera1_from_femur=shifted(truth.camera1_from_femur, z=2),
-        camera1_from_device=shifted(truth.camera1_from_device, z=2),
+    estimate = truth.with_object("femur", shifted(truth.camera1_from["femur"], z=2)).with_object(
+        "device", shifted(truth.camera1_from["device"], z=2)
     )
     found = errors(truth, estimate, POINTS)
     assert (found["entry_point_mm"], found["tip_mm"]) == pytest.approx((2, 2))
@@ -101,19 +108,17 @@ def test_equal_shifts_of_femur_and_device_cancel_in_the_relative_error(truth):
 
 
 def test_opposite_shifts_add_up_in_the_relative_error(truth):
-    estimate = replace(
-        truth,
-        camera1_from_femur=shifted(truth.camera1_from_femur, x=1),
-        camera1_from_device=shifted(truth.camera1_from_device, x=-1, y=1.5),
+    estimate = truth.with_object("femur", shifted(truth.camera1_from["femur"], x=1)).with_object(
+        "device", shifted(truth.camera1_from["device"], x=-1, y=1.5)
     )
     assert errors(truth, estimate, POINTS)["relative_mm"] == pytest.approx(2.5)
 
 
 def test_a_pelvis_shift_in_view_2_is_an_error_of_that_view_only(truth):
     """A shift s in camera 2 moves the source of camera 2 by −s, turned into camera 1: the length stays."""
-    views = truth.camera_from_pelvis.clone()
+    views = truth.camera_from("pelvis").clone()
     views[1] = shifted(views[1], x=0.3, z=0.4)
-    found = errors(truth, replace(truth, camera_from_pelvis=views), POINTS)
+    found = errors(truth, seen_in_views(truth, views), POINTS)
     assert found["view2"]["mm"] == pytest.approx(0.5)
     assert found["view2"]["deg"] == pytest.approx(0, abs=1e-6)
     assert found["view3"]["mm"] == pytest.approx(0, abs=1e-9)
@@ -122,17 +127,15 @@ def test_a_pelvis_shift_in_view_2_is_an_error_of_that_view_only(truth):
 
 def test_an_error_common_to_all_views_is_none_of_the_view_geometry(truth):
     wrong = rigid(exp_so3(vector(0.01, 0, 0.02)), vector(1, 2, 3))
-    found = errors(truth, replace(truth, camera_from_pelvis=truth.camera_from_pelvis @ wrong), POINTS)
+    found = errors(truth, seen_in_views(truth, truth.camera_from("pelvis") @ wrong), POINTS)
     assert found["view2"]["mm"] == pytest.approx(0, abs=1e-9)
     assert found["pelvis"]["mm"] > 1
 
 
 def test_lengths_and_angles_do_not_care_which_is_the_truth(truth):
     turn = rigid(exp_so3(vector(0.01, -0.02, 0.03)), vector(0.5, 0.2, -0.7))
-    estimate = replace(
-        truth,
-        camera1_from_femur=truth.camera1_from_femur @ turn,
-        camera1_from_device=truth.camera1_from_device @ turn,
+    estimate = truth.with_object("femur", truth.camera1_from["femur"] @ turn).with_object(
+        "device", truth.camera1_from["device"] @ turn
     )
     one, other = errors(truth, estimate, POINTS), errors(estimate, truth, POINTS)
     for key in ("entry_point_mm", "tip_mm", "relative_mm", "path_deg", "guide_deg"):
@@ -142,7 +145,7 @@ def test_lengths_and_angles_do_not_care_which_is_the_truth(truth):
 
 
 def test_without_a_device_only_bone_is_told(truth):
-    found = errors(truth, replace(truth, camera1_from_device=None), POINTS)
+    found = errors(truth, without(truth, "device"), POINTS)
     assert "device" not in found
     assert "relative_mm" not in found
     assert "entry_point_mm" in found
@@ -150,4 +153,4 @@ def test_without_a_device_only_bone_is_told(truth):
 
 def test_another_number_of_views_is_refused(truth):
     with pytest.raises(InputError, match="3 views"):
-        errors(truth, replace(truth, camera_from_pelvis=truth.camera_from_pelvis[:2]), POINTS)
+        errors(truth, truth.first_views(2), POINTS)

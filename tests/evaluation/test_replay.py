@@ -11,13 +11,17 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from test_report import CAMERA, POSE, procedure  # noqa: F401
 
 from femoreg_torch.case import read_case, read_result, write_json
 from femoreg_torch.commands.main import main
 from femoreg_torch.evaluation.replay import frames_of
-from femoreg_torch.geometry import project_points, rigid, transform_points
+from femoreg_torch.geometry import centred_camera, project_points, rigid, transform_points
+from femoreg_torch.registration import prepare_scene
 
+CAMERA = centred_camera(1000.0, (4.0, 4.0), (64, 64))  # as those of the procedure
+POSE = rigid(
+    torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64), torch.tensor([0.0, 0, 700]).double()
+)
 SHIFTS = (-60.0, -25.0, 0.0)  # mm along the columns: the pelvis, as it comes to its place
 EYE = torch.eye(4, dtype=torch.float64)
 
@@ -39,11 +43,12 @@ def stage(name: str, moments: list[dict[str, Any]], view: int | None = None, **p
 
 
 @pytest.fixture
-def run(procedure: tuple[Path, Path]) -> Path:  # noqa: F811
+def run(procedure: tuple[Path, Path]) -> Path:
     """A run in which the pelvis comes from the side, then the C-arm of view 2 is found, then the device."""
     folder, run = procedure
     result = json.loads((run / "result.json").read_text(encoding="utf-8"))
-    nominal = read_case(folder).device.camera1_from_device  # type: ignore[union-attr]
+    nominal = read_case(folder).objects["device"].start.camera1_from
+    assert nominal is not None
     start = {"pelvis": shifted(SHIFTS[0]), "femur": shifted(SHIFTS[0])}
     coming = [{"evaluations": n, "cost": 0.5 - n / 100, "camera1_from": {"pelvis": shifted(x)}} for n, x in
               enumerate(SHIFTS, 1)]  # fmt: skip
@@ -80,7 +85,7 @@ def green(picture: NDArray[np.uint8], row: int, view: int) -> NDArray[np.bool_]:
 
 def test_frames_follow_the_trace(run: Path) -> None:
     case = read_case(run.parent / "case")
-    frames = list(frames_of(read_result(run), case))
+    frames = list(frames_of(read_result(run), prepare_scene(case)))
     assert [frame.stage.partition(",")[0] for frame in frames] == [
         "start: landmarks of the network",
         *["1/3 pelvis in view 1"] * 4,

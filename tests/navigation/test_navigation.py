@@ -12,9 +12,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from femoreg_torch.case import Result
 from femoreg_torch.commands.main import main
 from femoreg_torch.files import write_json
-from femoreg_torch.navigation import clear_navigation, navigation_content, read_robot
+from femoreg_torch.geometry import poses_by_object
+from femoreg_torch.navigation import navigation_content, read_robot
 
 Matrix = NDArray[np.float64]
 
@@ -49,6 +51,7 @@ def write_run(folder: Path, trusted: bool = True, device: bool = True) -> Path:
         "quality": {
             "pelvis": {"trusted": True, "reason": "all views agree"},
             "femur": {"trusted": trusted, "reason": "view 2 would move the femur by (3.0, 0.1) mm"},
+            **({"device": {"trusted": True, "reason": "all views agree"}} if device else {}),
         },
         "trusted": trusted,
     }
@@ -129,20 +132,23 @@ def test_the_robots_flange_carries_the_device_onto_the_path(tmp_path: Path) -> N
     np.testing.assert_allclose(content["in_base"]["entry_point"], apply(base_from_femur, ENTRY), atol=1e-6)
 
 
-def test_a_known_case(tmp_path: Path) -> None:
-    """Guide along z, path along x, entry point 10 mm beyond the tip: a quarter turn about y, and tip to (0, 0, 110)."""
+def registered(entry_point: list[float], tip: list[float], path: list[float], guide: list[float]) -> Result:
+    """A result in which camera 1, femur and device have one frame."""
     eye = torch.eye(4, dtype=torch.float64)
-    result = {
-        "camera1_from_femur": eye,
-        "camera1_from_device": eye,
-        "points_camera1": {
-            "entry_point": torch.tensor([0.0, 0, 110]).double(),
-            "tip": torch.tensor([0.0, 0, 100]).double(),
-        },
-        "directions_camera1": {"path": torch.tensor([1.0, 0, 0]).double(), "guide": torch.tensor([0, 0, 1.0]).double()},
-        "trusted": True,
-    }
-    content = navigation_content(result, None)
+    numbers = {"entry_point": entry_point, "tip": tip, "path": path, "guide": guide}
+    vectors = {name: torch.tensor(value, dtype=torch.float64) for name, value in numbers.items()}
+    return Result(
+        poses_by_object(eye[None], "pelvis", {"femur": eye, "device": eye}),
+        quality={},
+        path=("femur", "device"),
+        points_camera1={name: vectors[name] for name in ("entry_point", "tip")},
+        directions_camera1={name: vectors[name] for name in ("path", "guide")},
+    )
+
+
+def test_a_known_case() -> None:
+    """Guide along z, path along x, entry point 10 mm beyond the tip: a quarter turn about y, and tip to (0, 0, 110)."""
+    content = navigation_content(registered([0, 0, 110], [0, 0, 100], [1, 0, 0], [0, 0, 1]), None)
     expected = torch.tensor([[0, 0, 1, -100], [0, 1, 0, 0], [-1, 0, 0, 110], [0, 0, 0, 1]]).double()
     torch.testing.assert_close(content["correction_in_device"], expected)
     assert content["angle_deg"] == pytest.approx(90)
@@ -151,14 +157,9 @@ def test_a_known_case(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_guide_along_the_path_or_against_it(sign: float) -> None:
-    eye, axis = torch.eye(4, dtype=torch.float64), torch.tensor([0.6, 0.0, 0.8]).double()
-    point = torch.tensor([1.0, 2, 3]).double()
-    result = {
-        "camera1_from_femur": eye,
-        "camera1_from_device": eye,
-        "points_camera1": {"entry_point": point, "tip": point},
-        "directions_camera1": {"path": sign * axis, "guide": axis},
-    }
+    axis = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+    point = torch.tensor([1.0, 2, 3], dtype=torch.float64)
+    result = registered(point.tolist(), point.tolist(), (sign * axis).tolist(), axis.tolist())
     correction = navigation_content(result, None)["correction_in_device"]
     torch.testing.assert_close(correction[:3, :3] @ axis, sign * axis)
     torch.testing.assert_close(correction[:3, :3] @ point + correction[:3, 3], point)
@@ -228,21 +229,19 @@ def test_a_new_navigation_leaves_nothing_of_the_old_one(tmp_path: Path) -> None:
     assert main(["navigate", str(run)]) == 0
     assert "base_from_femur" not in json.loads((run / "navigation.json").read_text())
     assert {path.stem for path in (run / "navigation").iterdir()} == {"femur_from_device", "correction_in_device"}
-    clear_navigation(run)
-    assert [path.name for path in run.iterdir()] == ["result.json"]
 
 
 def test_without_a_device_there_is_nothing_to_steer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = write_run(tmp_path / "run", device=False)
     assert main(["navigate", str(run)]) == 2
-    assert "no device was registered" in capsys.readouterr().err
+    assert "no tool was registered" in capsys.readouterr().err
     assert [path.name for path in run.iterdir()] == ["result.json"]
 
 
 def test_every_kind_of_calibration_file_gives_the_same(tmp_path: Path) -> None:
     expected = torch.from_numpy(BASE_FROM_FLANGE @ FLANGE_FROM_DEVICE)
-    by_flange = read_robot(write_flange(tmp_path / "robot.txt"))
-    torch.testing.assert_close(by_flange.base_from_device, expected)
+    by_flange = read_robot(write_flange(tmp_path / "robot.txt"), "device")
+    torch.testing.assert_close(by_flange.base_from_tool, expected)
     assert by_flange.base_from_flange is not None
     (tmp_path / "direct.txt").write_text(f"base_from_device\n{rows(expected.numpy())}")
     (tmp_path / "base_from_device.txt").write_text(f"# bare\n{rows(expected.numpy())}")
@@ -252,14 +251,14 @@ def test_every_kind_of_calibration_file_gives_the_same(tmp_path: Path) -> None:
     transform.SetTranslation(device_from_base[:3, 3].tolist())
     sitk.WriteTransform(transform, str(tmp_path / "base_from_device.tfm"))
     for name in ("direct.txt", "base_from_device.txt", "base_from_device.tfm"):
-        found = read_robot(tmp_path / name)
-        torch.testing.assert_close(found.base_from_device, expected, atol=1e-8, rtol=0)
+        found = read_robot(tmp_path / name, "device")
+        torch.testing.assert_close(found.base_from_tool, expected, atol=1e-8, rtol=0)
         assert found.base_from_flange is None
 
 
 def test_few_digits_do_not_leave_a_rotation_that_is_none(tmp_path: Path) -> None:
     (tmp_path / "base_from_device.txt").write_text(rows(np.round(pose(7), 5)))
-    rotation = read_robot(tmp_path / "base_from_device.txt").base_from_device[:3, :3]
+    rotation = read_robot(tmp_path / "base_from_device.txt", "device").base_from_tool[:3, :3]
     torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-12, rtol=0)
 
 

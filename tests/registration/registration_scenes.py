@@ -6,10 +6,10 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from femoreg_torch.case import Start
 from femoreg_torch.drr import project
-from femoreg_torch.geometry import CArm, about_point, centred_camera, exp_se3, rigid, rotation_angle
-from femoreg_torch.registration import Poses, Scene
-from femoreg_torch.registration.scene import Kind, RigidObject, Segmentation
+from femoreg_torch.geometry import CArm, Poses, about_point, centred_camera, exp_se3, rigid, rotation_angle
+from femoreg_torch.registration.scene import Kind, RigidObject, Scene, Segmentation
 from femoreg_torch.volume import Volume, axis_aligned
 
 CARM = CArm(centred_camera(1020.0, (3.0, 3.0), (88, 88)), (0.0, 0.0, 632.0), (0.0, 1.0, 0.0))
@@ -39,6 +39,7 @@ VOLUMES = {
     "femur": bone(2, (36, 20, 18), 0.06, (70, 0, 20)),  # in the same space: one CT holds both
     "device": bone(3, (12, 12, 30), 0.2),
 }
+STARTS = {"pelvis": Start(), "femur": Start(beside="pelvis")}
 CLASSES = {"pelvis": (1, 2), "femur": (3,)}  # of a segmentation with four classes
 REFERENCE_POINTS = {"pelvis": float64(0, 0, 0), "femur": float64(64, 0, -20), "device": float64(0, 0, 0)}
 
@@ -97,11 +98,11 @@ def make_scene(
         images["device"] = tuple(image(v, ("pelvis", "femur", "device")) for v in views)
     always: tuple[Kind, ...] = ("anatomy", "device")
     objects = {
-        name: RigidObject(VOLUMES[name], REFERENCE_POINTS[name], always, classes=classes)
+        name: RigidObject(VOLUMES[name], REFERENCE_POINTS[name], always, STARTS[name], classes)
         for name, classes in CLASSES.items()
     }
     start = poses.camera1_from["device"] if camera1_from_device is None else camera1_from_device
-    objects["device"] = RigidObject(VOLUMES["device"], REFERENCE_POINTS["device"], ("device",), start)
+    objects["device"] = RigidObject(VOLUMES["device"], REFERENCE_POINTS["device"], ("device",), Start(start))
     return Scene(CARM, objects, images)
 
 

@@ -6,13 +6,16 @@ import pytest
 import torch
 from registration_scenes import REFERENCE_POINTS, make_scene, off, true_poses
 
-from femoreg_torch.geometry import log_so3
-from femoreg_torch.optimize import LevenbergMarquardt, minimise
+from femoreg_torch.geometry import Poses, log_so3
+from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
-from femoreg_torch.registration.objective import Level, image_costs, stage_objective
-from femoreg_torch.registration.scene import Body, Poses, Scene, moved, reference_point_in_view
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.scene import Body, Scene, moved, reference_point_in_view
+from femoreg_torch.similarity import GradNcc
 
-_LEVEL = Level(downsample=1, step_mm=2.0, patch_radius=4)
+_LEVEL = Level(pixel_mm=3.0, step_mm=2.0)
+_SIMILARITY = GradNcc(patch_radius=4)
 _SCALE = torch.tensor([math.radians(1)] * 3 + [1.0, 1.0, 4.0], dtype=torch.float64)
 
 
@@ -21,9 +24,9 @@ def _solve(scene: Scene, poses: Poses) -> Poses:
     bodies = [Body((name,), 0, reference_point_in_view(scene, poses, name, 0), _SCALE) for name in REFERENCE_POINTS]
     bodies += [Body((), view, reference_point_in_view(scene, poses, "pelvis", view), _SCALE) for view in (1, 2)]
     images = [(kind, view) for kind in ("anatomy", "device") for view in range(3)]
-    costs = image_costs(scene, poses, tuple(bodies), tuple(REFERENCE_POINTS), images, _LEVEL)
+    costs = image_costs(scene, poses, tuple(bodies), tuple(REFERENCE_POINTS), images, _LEVEL, _SIMILARITY)
     objective = stage_objective(costs, tuple(bodies), None)
-    result = minimise(objective, 30, LevenbergMarquardt(max_iterations=4, tol_x=1e-3, tol_f=1e-7), seed=0)
+    result = LevenbergMarquardt(max_iterations=4, tol_x=1e-3, tol_f=1e-7).minimise(objective, 30, seed=0)
     return moved(poses, tuple(bodies), result.delta)
 
 
@@ -33,7 +36,7 @@ def solutions() -> tuple[list[Poses], PoseCovariance]:
     truth = true_poses()
     scenes = [make_scene(truth, seed=seed, noise=0.02) for seed in range(5)]
     found = [_solve(scene, truth) for scene in scenes]
-    covariance = pose_covariance(scenes[0], found[0], _LEVEL)
+    covariance = pose_covariance(scenes[0], found[0], _LEVEL, _SIMILARITY)
     return found, covariance
 
 
@@ -48,7 +51,6 @@ def test_the_prediction_is_of_the_size_of_the_spread(solutions: tuple[list[Poses
         rotation, translation = covariance.deviations(name)
         ratio = torch.tensor([*rotation, *translation]) / spread
         # Five samples know a deviation to a third; depth varies with what else is fitted.
-        print(name, ratio)
         assert 0.4 < ratio.log().mean().exp() < 2.5, (name, ratio)
 
 
@@ -57,7 +59,7 @@ def test_a_device_held_in_a_wrong_place_is_pulled_back(solutions: tuple[list[Pos
     found, settled = solutions
     scene = make_scene(true_poses(), seed=0, noise=0.02)
     wrong = off(found[0].camera1_from["device"], REFERENCE_POINTS["device"], (0, 0, 0), (0.4, -0.3, 0))
-    pulled = pose_covariance(scene, found[0].with_object("device", wrong), _LEVEL)
+    pulled = pose_covariance(scene, found[0].with_object("device", wrong), _LEVEL, _SIMILARITY)
     first = 6 * settled.bodies.index("device") + 3
     back = (pulled.step - settled.step)[first : first + 2]
     torch.testing.assert_close(back, torch.tensor([-0.4, 0.3], dtype=torch.float64), atol=0.15, rtol=0)

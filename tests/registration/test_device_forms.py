@@ -11,31 +11,31 @@ import trimesh
 from registration_scenes import CARM, VOLUMES, error, float64, make_scene, off, true_poses
 from torch import Tensor
 
-from femoreg_torch.case import Device
+from femoreg_torch.case import Model, Start
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import centred_camera
 from femoreg_torch.optimize import LevenbergMarquardt
-from femoreg_torch.registration import Plan, Scene, prepare, run_plan
-from femoreg_torch.registration.objective import Level
-from femoreg_torch.registration.plan import BodyPlan, OrbitSearch, Stage
+from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, prepare, run_plan
 from femoreg_torch.registration.scene import RigidObject
-from femoreg_torch.registration.workflow import run_stage
+from femoreg_torch.registration.stage import run_stage
+from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import voxelise_mesh
 
-LEVEL = Level(downsample=1, step_mm=0.5, patch_radius=4)
+LEVEL = Level(pixel_mm=3, step_mm=0.5)
+SIMILARITY = GradNcc(patch_radius=4)
 TRUTH = true_poses()
 CENTRE = float64(10, 4, 40)
 BOXES = [((14, 14, 80), (7, 7, 40)), ((40, 10, 16), (20, 5, 20)), ((10, 30, 12), (6, 15, 60))]  # size and middle, mm
 
 
-def as_mesh(path: Path) -> Device:
+def as_mesh(path: Path) -> Model:
     parts = [trimesh.creation.box(size).apply_translation(middle) for size, middle in BOXES]
     trimesh.util.concatenate(parts).export(path)
-    return Device(path, 5000.0, {"center": CENTRE}, torch.eye(4, dtype=torch.float64))
+    return Model(path, 5000.0)
 
 
-def as_labels(path: Path) -> Device:
+def as_labels(path: Path) -> Model:
     """The same boxes as label 2, by which voxel centres lie inside them; 0.5 mm voxels."""
     z, y, x = np.meshgrid(*(np.arange(-2.25, high, 0.5) for high in (83, 33, 43)), indexing="ij")
     inside = np.zeros(x.shape, bool)
@@ -45,20 +45,25 @@ def as_labels(path: Path) -> Device:
     image.SetSpacing((0.5,) * 3)
     image.SetOrigin((-2.25,) * 3)
     sitk.WriteImage(image, str(path))
-    return Device(path, 5000.0, {"center": CENTRE}, torch.eye(4, dtype=torch.float64), labels=(2,))
+    return Model(path, 5000.0, labels=(2,))
 
 
-def scene_of(device: Device, images: tuple[Tensor, ...]) -> Scene:
+def scene_of(device: Model, images: tuple[Tensor, ...]) -> Scene:
     objects = {
         "pelvis": RigidObject(VOLUMES["pelvis"], float64(0, 0, 0), ("anatomy", "device")),
-        "device": RigidObject(prepare.device_attenuation(device), CENTRE, ("device",), device.camera1_from_device),
+        "device": RigidObject(
+            prepare.model_attenuation(device),
+            CENTRE,
+            ("device",),
+            Start(camera1_from=torch.eye(4, dtype=torch.float64)),
+        ),
     }
     return Scene(CARM, objects, {"anatomy": images, "device": images})
 
 
 def test_a_labelled_volume_registers_as_the_mesh(tmp_path: Path) -> None:
     mesh, labels = as_mesh(tmp_path / "device.stl"), as_labels(tmp_path / "device.nii.gz")
-    fine = voxelise_mesh(trimesh.load_mesh(mesh.model_path), 0.25, 5000.0)
+    fine = voxelise_mesh(trimesh.load_mesh(mesh.path), 0.25, 5000.0)
     camera = centred_camera(1020.0, (1.5, 1.5), (176, 176))  # twice as fine as what is registered
     true = TRUTH.camera1_from["device"].clone()
     true[:3, 3] = float64(10, 12, 560) - true[:3, :3] @ CENTRE  # its middle is well within all images
@@ -74,8 +79,9 @@ def test_a_labelled_volume_registers_as_the_mesh(tmp_path: Path) -> None:
         "all",
         ["device"],
         ["pelvis", "device"],
-        [BodyPlan(["device"], "device", [2, 2, 2], [3, 3, 3])],
+        [BodyPlan(["device"], [2, 2, 2], [3, 3, 3])],
         LEVEL,
+        SIMILARITY,
         LevenbergMarquardt(max_iterations=20),
     )
     by_mesh, by_labels = (
@@ -96,7 +102,7 @@ def test_an_orbit_search_looks_at_the_kind_of_image_it_names() -> None:
     scene = make_scene(TRUTH)
     blank = tuple(torch.zeros_like(image) for image in scene.images["anatomy"])
     scene = replace(scene, images={**scene.images, "anatomy": blank})
-    plan = Plan("test", (OrbitSearch("orbit", ["device"], 20, 5, LEVEL, kind="device"),))
+    plan = Plan("test", (OrbitSearch("orbit", ["device"], ["device"], 20, 5, LEVEL, SIMILARITY),))
     found = run_plan(scene, plan, TRUTH.camera1_from["pelvis"], 0, lambda *_: None).poses.camera_from_camera1
     for view in (1, 2):
         assert error(found[view], TRUTH.camera_from_camera1[view], float64(0, 0, 632))[1] < 3.0
@@ -104,6 +110,8 @@ def test_an_orbit_search_looks_at_the_kind_of_image_it_names() -> None:
 
 def test_views_by_a_device_that_is_in_no_image_are_refused() -> None:
     scene = make_scene(TRUTH, with_device=False)
-    plan = Plan("mine", (OrbitSearch("orbit", ["device"], 20, 5, LEVEL, kind="device"),))
-    with pytest.raises(InputError, match=r"registration preset mine: it finds the C-arm .* by the device"):
+    plan = Plan("mine", (OrbitSearch("orbit", ["device"], ["device"], 20, 5, LEVEL, SIMILARITY),))
+    with pytest.raises(
+        InputError, match=r"registration preset mine, step “orbit”: it finds the C-arm .* the kind “device”"
+    ):
         run_plan(scene, plan, TRUTH.camera1_from["pelvis"], 0, lambda *_: None)

@@ -7,28 +7,56 @@ import yaml
 from femoreg_torch.configs import preset_names
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import load_carm
 from femoreg_torch.optimize import Bobyqa, CmaEs, LevenbergMarquardt
-from femoreg_torch.registration import load_plan
-from femoreg_torch.registration import plan as plan_module
-from femoreg_torch.registration.plan import OrbitSearch, Stage, plan_from
+from femoreg_torch.registration import BodyPlan, OrbitSearch, Stage, load_plan, plan_from
+from femoreg_torch.registration.level import Level, binning
+from femoreg_torch.similarity import GradNcc, Ncc
 
 STAGE = {
     "name": "a",
+    "kind": "stage",
     "images": "first",
     "kinds": ["anatomy"],
     "render": ["pelvis"],
     "bodies": [{"move": ["pelvis"], "centre": "pelvis", "rotation_deg": [1, 1, 1], "translation_mm": [1, 1, 1]}],
-    "level": {"downsample": 8, "step_mm": 1, "patch_radius": 5},
-    "optimiser": {"population": 10},
+    "level": {"pixel_mm": 1.55, "step_mm": 1},
+    "similarity": {"kind": "ncc"},
+    "optimiser": {"kind": "cma_es", "population": 10},
 }
+OF_THE_HIP = sorted(set(preset_names("registration")) - {"rigid"})
 
 
-@pytest.mark.parametrize("name", preset_names("registration"))
+@pytest.mark.parametrize("name", OF_THE_HIP)
 def test_every_preset_loads_and_registers_everything(name: str) -> None:
-    steps = load_plan(name).steps
-    moved = {what for step in steps if isinstance(step, Stage) for body in step.bodies for what in body.move}
+    plan = load_plan(name)
+    moved = {what for stage in plan.stages for body in stage.bodies for what in body.move}
     assert moved - {"views"} == {"pelvis", "femur", "device", "view"}
-    assert any(isinstance(step, OrbitSearch) for step in steps)
+    assert any(isinstance(step, OrbitSearch) for step in plan.steps)
+
+
+def test_the_preset_for_any_objects_names_none() -> None:
+    for step in load_plan("rigid").steps:
+        assert isinstance(step, Stage | OrbitSearch)
+        assert (step.kinds, step.render) == (["all"], ["all"])
+    stages = load_plan("rigid").stages
+    assert {what for stage in stages for body in stage.bodies for what in body.move} == {"all", "each", "view", "views"}
+
+
+def test_a_stage_is_what_its_keys_say() -> None:
+    (stage,) = plan_from("mine", {"steps": [STAGE]}).steps
+    body = BodyPlan(["pelvis"], [1, 1, 1], [1, 1, 1], "pelvis")
+    assert stage == Stage("a", "first", ["anatomy"], ["pelvis"], [body], Level(1.55, 1), Ncc(), CmaEs(population=10))
+
+
+def test_levels_of_the_presets_are_whole_pixels_of_the_c_arm_binned_or_not() -> None:
+    """32, 16, 8 and 4 pixels of 0.194 mm."""
+    camera = load_carm("cios_fusion").camera
+    levels = (6.2, 3.1, 1.55, 0.78)
+    used = {step.level.pixel_mm for name in OF_THE_HIP for step in load_plan(name).steps}  # type: ignore[attr-defined]
+    assert used == set(levels)
+    for factor, pixels in ((1, [32, 16, 8, 4]), (2, [16, 8, 4, 2]), (4, [8, 4, 2, 1])):
+        assert [binning(level, camera.downsampled(factor)) for level in levels] == pixels
 
 
 def test_weights_of_pixels_are_a_stage_s_own_and_bones_need_segmentations() -> None:
@@ -36,19 +64,19 @@ def test_weights_of_pixels_are_a_stage_s_own_and_bones_need_segmentations() -> N
         plan_from("mine", {"steps": [STAGE, STAGE | more]})
         for more in ({}, {"weights": ["clear"]}, {"weights": ["bones", "clear"]})
     )
-    assert [stage.weights for stage in bones.steps if isinstance(stage, Stage)] == [[], ["bones", "clear"]]
+    assert [stage.weights for stage in bones.stages] == [[], ["bones", "clear"]]
     assert [plan.needs_segmentations for plan in (plain, clear, bones)] == [False, False, True]
 
 
 def test_the_paper_preset_is_the_papers() -> None:
-    steps = load_plan("paper").steps
-    assert {step.level.downsample for step in steps} == {4}
-    orbit = next(step for step in steps if isinstance(step, OrbitSearch))
+    plan = load_plan("paper")
+    (orbit,) = (step for step in plan.steps if isinstance(step, OrbitSearch))
     assert (orbit.half_range_deg, orbit.step_deg) == (45, 0.5)
-    joint = [step for step in steps if isinstance(step, Stage) and len(step.bodies) > 1]
-    assert all(isinstance(step.optimiser, Bobyqa) for step in joint)
-    single = [step for step in steps if isinstance(step, Stage) and len(step.bodies) == 1]
-    assert all(isinstance(step.optimiser, CmaEs) for step in single)
+    for step in (*plan.stages, orbit):
+        assert step.level.pixel_mm == 0.78
+        assert step.similarity == GradNcc(patch_radius=10)
+    assert all(isinstance(stage.optimiser, Bobyqa) for stage in plan.stages if len(stage.bodies) > 1)
+    assert all(isinstance(stage.optimiser, CmaEs) for stage in plan.stages if len(stage.bodies) == 1)
 
 
 def test_the_wide_preset_is_fast_with_two_more_searches_for_the_device() -> None:
@@ -67,12 +95,22 @@ def test_the_wide_preset_is_fast_with_two_more_searches_for_the_device() -> None
 def test_the_fiducial_preset_finds_the_views_by_the_device_alone() -> None:
     *steps, last, finest = load_plan("device_fiducial").steps
     assert (last, finest) == load_plan("fast").steps[-2:]
-    by_device = [step for step in steps if step.render == ["device"]]
+    by_device = [step for step in steps if isinstance(step, Stage | OrbitSearch) and step.render == ["device"]]
     assert steps[: len(by_device)] == by_device
-    assert [step.kind for step in steps if isinstance(step, OrbitSearch)] == ["device"]
+    assert [step.kinds for step in steps if isinstance(step, OrbitSearch)] == [["device"]]
     moving = [step for step in steps if isinstance(step, Stage) for b in step.bodies if b.move in (["view"], ["views"])]
     assert moving
     assert all(step in by_device and step.kinds == ["device"] for step in moving)
+
+
+def test_a_file_may_change_a_preset(tmp_path: Path) -> None:
+    change = {"name": "orbit search", "half_range_deg": 20}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"extends": "fast", "steps": [change]}))
+    fast, mine = load_plan("fast"), load_plan(tmp_path / "mine.yaml")
+    assert [step.name for step in mine.steps] == [step.name for step in fast.steps]
+    (orbit,) = (step for step in mine.steps if step not in fast.steps)
+    assert isinstance(orbit, OrbitSearch)
+    assert orbit.half_range_deg == 20
 
 
 @pytest.mark.parametrize(
@@ -80,20 +118,35 @@ def test_the_fiducial_preset_finds_the_views_by_the_device_alone() -> None:
     [
         ({"images": "second"}, "step 1.*images"),
         ({"colour": "red"}, "step 1.*colour"),
+        ({"kind": "stag"}, "step 1: unknown kind 'stag'. Known kinds: stage, orbit_search"),
+        ({"kind": None}, "step 1: a mapping with the key `kind`"),
         ({"weights": ["bone"]}, "step 1.*weights"),
-        ({"bodies": [{**STAGE["bodies"][0], "rotation_deg": [1, 1]}]}, "need three numbers"),  # type: ignore[index,dict-item]
-        ({"optimiser": {"popsize": 3}}, "step 1"),
+        ({"bodies": [{**STAGE["bodies"][0], "rotation_deg": [1, 1]}]}, "step 1.*need three numbers"),  # type: ignore[index,dict-item]
+        ({"bodies": [{**STAGE["bodies"][0], "move": ["views"]}]}, "step 1.*needs `images: all`"),  # type: ignore[index,dict-item]
+        ({"level": {"pixel_mm": 0, "step_mm": 1}}, "step 1.*must be positive"),
+        ({"similarity": {"kind": "mi"}}, "step 1, similarity: unknown kind 'mi'. Known kinds: grad_ncc, ncc"),
+        ({"similarity": {"kind": "ncc", "radius": 3}}, "step 1, similarity, ncc: unknown key 'radius'"),
+        ({"optimiser": {"population": 3}}, "step 1, optimiser: a mapping with the key `kind`"),
+        ({"optimiser": {"kind": "cma_es", "population": "many"}}, "step 1, optimiser, cma_es: .*population"),
     ],
 )
-def test_a_mistake_is_told_with_preset_and_step(
-    change: dict[str, object], says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    text = yaml.safe_dump({"steps": [STAGE | change]})
-    monkeypatch.setattr(plan_module, "load_preset", lambda *_: yaml.safe_load(text))
-    with pytest.raises(InputError, match=says):
-        load_plan("mine")
+def test_a_mistake_is_told_with_preset_and_step(change: dict[str, object], says: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"steps": [STAGE | change]}))
+    with pytest.raises(InputError, match=f"mine.yaml, {says}"):
+        load_plan(tmp_path / "mine.yaml")
+
+
+@pytest.mark.parametrize("key", ["similarity", "optimiser", "level"])
+def test_a_missing_key_is_named(key: str) -> None:
+    with pytest.raises(InputError, match=f"preset mine, step 1: .*{key}"):
+        plan_from("mine", {"steps": [{name: value for name, value in STAGE.items() if name != key}]})
 
 
 def test_an_unknown_preset_lists_the_known_ones() -> None:
     with pytest.raises(InputError, match=r"no registration preset 'slow'; there are: .*paper"):
         load_plan("slow")
+
+
+def test_a_preset_holds_steps_and_nothing_else() -> None:
+    with pytest.raises(InputError, match="registration preset mine: unknown key 'stages'"):
+        plan_from("mine", {"stages": []})

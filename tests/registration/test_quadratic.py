@@ -7,17 +7,22 @@ import pytest
 import torch
 from registration_scenes import REFERENCE_POINTS, VOLUMES, float64, make_scene, off, segmentations, true_poses
 
-from femoreg_torch.errors import InputError
-from femoreg_torch.registration.objective import PLAIN, Imaging, Level, Prior, image_costs, stage_objective
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import PLAIN, Imaging, Prior, image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, reference_point_in_view
 from femoreg_torch.registration.weights import Weighting
+from femoreg_torch.similarity import GradNcc, Ncc, Similarity
 
-_LEVEL = Level(downsample=1, step_mm=2.0, patch_radius=5)
+_LEVEL = Level(pixel_mm=3.0, step_mm=2.0)
+_SIMILARITY = GradNcc(patch_radius=5)
 _SCALE = float64(*[math.radians(1)] * 3, 1.0, 1.0, 4.0)
 
 
 def _joint_objective(  # type: ignore[no-untyped-def]
-    prior: Prior | None = None, weights: tuple[Weighting, ...] = (), imaging: Imaging = PLAIN
+    prior: Prior | None = None,
+    weights: tuple[Weighting, ...] = (),
+    imaging: Imaging = PLAIN,
+    similarity: Similarity = _SIMILARITY,
 ):
     """Every object and every C-arm but the first free, a little off the truth."""
     poses = true_poses()
@@ -29,17 +34,25 @@ def _joint_objective(  # type: ignore[no-untyped-def]
     )
     views = tuple(Body((), v, reference_point_in_view(scene, poses, "pelvis", v), _SCALE) for v in (1, 2))
     images = [(kind, view) for kind in ("anatomy", "device") for view in range(3)]
-    costs = image_costs(scene, poses, (*objects, *views), tuple(REFERENCE_POINTS), images, _LEVEL, weights, imaging)
+    render = tuple(REFERENCE_POINTS)
+    costs = image_costs(scene, poses, (*objects, *views), render, images, _LEVEL, similarity, weights, imaging)
     return stage_objective(costs, (*objects, *views), prior)
 
 
 @pytest.mark.parametrize(
-    ("weights", "imaging"), [((), PLAIN), (("bones",), PLAIN), ((), Imaging(scatter=0.4, tissue=0.8))]
+    ("weights", "imaging", "similarity"),
+    [
+        ((), PLAIN, _SIMILARITY),
+        (("bones",), PLAIN, _SIMILARITY),
+        ((), Imaging(scatter=0.4, tissue=0.8), _SIMILARITY),
+        (("bones",), PLAIN, Ncc()),
+        (("bones",), PLAIN, Ncc(5)),
+    ],
 )
 def test_the_gradient_is_the_slope_of_the_values_and_the_curvature_is_never_negative(
-    weights: tuple[Weighting, ...], imaging: Imaging
+    weights: tuple[Weighting, ...], imaging: Imaging, similarity: Similarity
 ) -> None:
-    objective = _joint_objective(Prior(rotation_deg=5, translation_mm=10, weight=0.1), weights, imaging)
+    objective = _joint_objective(Prior(rotation_deg=5, translation_mm=10, weight=0.1), weights, imaging, similarity)
     delta = 0.3 * torch.randn(30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     model = objective.quadratic(delta)
     h = 0.04 if imaging.scatter else 0.02  # with less contrast a small step drowns in single precision
@@ -56,7 +69,7 @@ def test_at_the_solution_the_curvature_is_that_of_the_values() -> None:
     poses = true_poses()
     scene = make_scene(poses)
     body = Body(("pelvis", "femur"), 0, reference_point_in_view(scene, poses, "pelvis", 0), _SCALE)
-    costs = image_costs(scene, poses, (body,), ("pelvis", "femur"), [("anatomy", 0)], _LEVEL)
+    costs = image_costs(scene, poses, (body,), ("pelvis", "femur"), [("anatomy", 0)], _LEVEL, _SIMILARITY)
     objective = stage_objective(costs, (body,), None)
     hessian = objective.quadratic(torch.zeros(6, dtype=torch.float64)).hessian
     for axis in range(5):
@@ -77,7 +90,11 @@ def test_scatter_fills_dark_shadows() -> None:
     assert torch.allclose(slope, Imaging(scatter=0.25).slope(integrals.detach()))
 
 
-def test_tissue_must_be_there_to_be_drawn() -> None:
+def test_a_scene_without_soft_tissue_draws_none() -> None:
     poses = true_poses()
-    with pytest.raises(InputError, match="the scene has none"):
-        image_costs(make_scene(poses), poses, (), ("pelvis",), [("anatomy", 0)], _LEVEL, (), Imaging(tissue=1.0))
+    nothing = torch.zeros(1, 0, dtype=torch.float64)
+    plain, asked = (
+        image_costs(make_scene(poses), poses, (), ("pelvis",), [("anatomy", 0)], _LEVEL, _SIMILARITY, (), imaging)
+        for imaging in (Imaging(), Imaging(tissue=1.0))
+    )
+    assert torch.equal(plain(nothing), asked(nothing))

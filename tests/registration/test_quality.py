@@ -5,19 +5,13 @@ from dataclasses import replace
 import pytest
 from registration_scenes import REFERENCE_POINTS, float64, make_scene, off, true_poses
 
-from femoreg_torch.registration import Scene, quality
-from femoreg_torch.registration.objective import Level
+from femoreg_torch.case import Start
+from femoreg_torch.case.trace import Restart, StageRecord
 from femoreg_torch.registration.quality import Limits, assess
-from femoreg_torch.registration.restarts import Restart
-from femoreg_torch.registration.workflow import StepTrace
+from femoreg_torch.registration.scene import Scene
 
 TRUTH = true_poses()
 LIMITS = Limits()
-
-
-@pytest.fixture(autouse=True)
-def whole_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(quality, "_LEVEL", Level(downsample=1, step_mm=2.0, patch_radius=4))
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +49,7 @@ def test_a_wrong_view_is_noticed(scene: Scene) -> None:
 
 def test_displacement_is_told_from_the_nominal_pose_and_from_the_place_in_the_ct(scene: Scene) -> None:
     """The femur is turned about its head by about 11°, the device is nominal at the truth."""
-    nominal = replace(scene.objects["device"], camera1_from=TRUTH.camera1_from["device"])
+    nominal = replace(scene.objects["device"], start=Start(TRUTH.camera1_from["device"]))
     known = replace(scene, objects={**scene.objects, "device": nominal})
     moved = off(TRUTH.camera1_from["device"], REFERENCE_POINTS["device"], (0, 0.5, 0), (0, 0, 1.0))
     found = assess(known, TRUTH.with_object("device", moved), LIMITS)
@@ -78,7 +72,7 @@ def test_a_femur_out_of_its_joint_is_not_trusted(scene: Scene) -> None:
     )
     found = assess(scene, TRUTH.with_object("femur", apart), blind)
     assert found["pelvis"].trusted
-    assert found["femur"].reason == "the femur lies 9.0 mm from where the CT has it"
+    assert found["femur"].reason == "the femur lies 9.0 mm from its place beside the pelvis"
 
 
 @pytest.mark.parametrize(
@@ -86,7 +80,7 @@ def test_a_femur_out_of_its_joint_is_not_trusted(scene: Scene) -> None:
 )
 def test_a_rival_that_fits_as_well_is_a_doubt(scene: Scene, cost: float, apart_deg: float, trusted: bool) -> None:
     rival = Restart(cost, apart_deg, 3.0)
-    step = StepTrace("femur in view 1", None, TRUTH, None, 0.4, 100, 1.0, restarts=(rival,), moving=("femur",))
+    step = StageRecord("femur in view 1", None, 0.4, 100, 1.0, "flat", TRUTH, (rival,), moving=("femur",))
     found = assess(scene, TRUTH, LIMITS, trace=(step,))
     assert found["pelvis"].trusted
     assert found["femur"].trusted is trusted

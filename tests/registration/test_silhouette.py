@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import Detection, network_camera
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
@@ -18,10 +19,10 @@ from femoreg_torch.geometry import (
     rotation_angle,
     transform_points,
 )
-from femoreg_torch.registration.scene import Segmentation
-from femoreg_torch.registration.silhouette import hip_mask, refine_by_silhouette
+from femoreg_torch.registration.scene import Outline, Segmentation
+from femoreg_torch.registration.silhouette import outline_of, refine_by_silhouette
 from femoreg_torch.registration.start import find_start
-from femoreg_torch.volume import HIP_LANDMARKS, Volume, axis_aligned
+from femoreg_torch.volume import BoneLabels, Volume, axis_aligned
 
 CAMERA = centred_camera(1020.0, (0.776, 0.776), (384, 384))
 AP = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
@@ -30,7 +31,7 @@ CENTRE = torch.tensor([4.0, -6.0, 740.0], dtype=torch.float64)
 
 
 def labels(spacing: float, scale: float = 1.0) -> Volume:
-    """Two leaning rings (labels 1 and 2) with a wing behind each; `scale` stretches the patient from side to side."""
+    """Two leaning rings (left 1, right 2) with a wing behind each; `scale` stretches the patient from side to side."""
     axis = torch.arange(-120, 120, spacing, dtype=torch.float64)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     volume = torch.zeros(x.shape, dtype=torch.uint8)
@@ -40,6 +41,12 @@ def labels(spacing: float, scale: float = 1.0) -> Volume:
         wing = ((sign * x / scale - 70) / 38) ** 2 + ((y - 30) / 9) ** 2 + ((z - 45) / 45) ** 2 < 1
         volume[ring | wing] = label
     return Volume(volume, axis_aligned((spacing,) * 3, (-120.0,) * 3))
+
+
+def outline(spacing: float, scale: float = 1.0) -> Outline:
+    found = outline_of(BoneLabels(labels(spacing, scale), {"hip_left": 1, "hip_right": 2}), HIP)
+    assert found is not None
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +78,6 @@ def errors(pose: Tensor) -> tuple[float, float]:
 @pytest.mark.parametrize("shutter", [0, 150])
 def test_a_start_far_off_is_brought_near(seen: Tensor, shutter: int) -> None:
     """Also where a shutter hides the left of the image, of which the network says nothing."""
-    hips = hip_mask(labels(2.0), (1, 2, 4))
-    assert hips is not None
     image = torch.rand(CAMERA.shape, generator=torch.Generator().manual_seed(1))
     image[:, :shutter] = 2.0
     probabilities = seen.clone()
@@ -80,7 +85,7 @@ def test_a_start_far_off_is_brought_near(seen: Tensor, shutter: int) -> None:
     covariance = torch.diag(torch.tensor([0.08, 0.08, 0.04, 3, 3, 20], dtype=torch.float64) ** 2)
     start = off_by(7.0, 25.0)
     bones = Segmentation(probabilities, network_camera(CAMERA).downsampled(2))
-    fit = refine_by_silhouette(hips, start, CENTRE, covariance, bones, image, CAMERA)
+    fit = refine_by_silhouette(outline(2.0), HIP, start, CENTRE, covariance, bones, image, CAMERA)
     assert errors(start) == pytest.approx((7.0, 25.0), rel=0.02)
     turned, depth = errors(fit.camera_from_ct)
     assert turned < 2.5  # 0.3 mm of the outline, a tenth of a pixel
@@ -97,22 +102,34 @@ def detection(seen: Tensor, points: Tensor) -> Detection:
 
 def test_another_patient_is_refused(seen: Tensor) -> None:
     points = torch.randn(14, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 40
-    landmarks = dict(zip(HIP_LANDMARKS, points, strict=True))
+    landmarks = dict(zip(HIP.landmark_names, points, strict=True))
     image = torch.rand(CAMERA.shape)
-    found = find_start(landmarks, detection(seen, points), image, CAMERA, hip_mask(labels(2.0), (1, 2)))
+    found = find_start(landmarks, detection(seen, points), image, CAMERA, outline(2.0), HIP)
     assert errors(found.camera_from_ct)[0] < 0.5
     assert found.overlap is not None
     with pytest.raises(InputError, match=r"agree by \d+% only .*same patient"):
-        find_start(landmarks, detection(seen, points), image, CAMERA, hip_mask(labels(2.0, 0.7), (1, 2)))
+        find_start(landmarks, detection(seen, points), image, CAMERA, outline(2.0, 0.7), HIP)
     blind = replace(detection(seen, points), segmentation=torch.zeros_like(seen))
     with pytest.raises(InputError, match="agree by 0% only"):
-        find_start(landmarks, blind, image, CAMERA, hip_mask(labels(2.0), (1, 2)))
+        find_start(landmarks, blind, image, CAMERA, outline(2.0), HIP)
 
 
-def test_hips_of_other_labels_are_not_compared(seen: Tensor) -> None:
-    assert hip_mask(labels(4.0), (7,)) is None
+def test_one_half_of_a_pelvis_is_compared_by_itself(seen: Tensor) -> None:
+    """The CT holds the left hip bone alone, while the image shows both."""
+    half = outline_of(BoneLabels(labels(2.0), {"hip_left": 1}), HIP)
+    assert half is not None
     points = torch.randn(14, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 40
-    landmarks = dict(zip(HIP_LANDMARKS, points, strict=True))
-    found = find_start(landmarks, detection(seen, points), torch.rand(CAMERA.shape), CAMERA, None)
+    landmarks = dict(zip(HIP.landmark_names, points, strict=True))
+    found = find_start(landmarks, detection(seen, points), torch.rand(CAMERA.shape), CAMERA, half, HIP)
+    assert errors(found.camera_from_ct)[0] < 0.5
+    assert found.overlap is not None
+
+
+def test_a_pelvis_in_one_label_is_not_compared(seen: Tensor) -> None:
+    assert outline_of(BoneLabels(labels(4.0), {"pelvis": 1}), HIP) is None
+    assert outline_of(BoneLabels(labels(4.0), {"hip_left": 1}), None) is None
+    points = torch.randn(14, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 40
+    landmarks = dict(zip(HIP.landmark_names, points, strict=True))
+    found = find_start(landmarks, detection(seen, points), torch.rand(CAMERA.shape), CAMERA, None, HIP)
     assert found.overlap is None
     assert errors(found.camera_from_ct)[0] < 0.5

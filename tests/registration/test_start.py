@@ -2,54 +2,95 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
 
+from femoreg_torch.anatomy import HIP
+from femoreg_torch.case import Case, CaseObject, View
 from femoreg_torch.detect import Detection
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import centred_camera, project_points, rotation_angle, transform_points
-from femoreg_torch.registration.start import find_start, start_from_landmarks
-from femoreg_torch.volume import HIP_LANDMARKS
+from femoreg_torch.geometry import CArm, centred_camera, project_points, rotation_angle, transform_points
+from femoreg_torch.registration import RigidObject, Scene
+from femoreg_torch.registration.start import find_start, start_by_detection, start_by_landmarks
+from femoreg_torch.volume import Volume, axis_aligned
 
 CAMERA = centred_camera(1020.0, (0.776, 0.776), (384, 384))
-CASE: Any = SimpleNamespace(
-    views=[SimpleNamespace(anatomy=Path("view1.tif"))],
-    landmarks={name: torch.zeros(3, dtype=torch.float64) for name in HIP_LANDMARKS},
-    carm=SimpleNamespace(camera=CAMERA),
-)
-SCENE: Any = SimpleNamespace(images={"anatomy": (torch.rand(CAMERA.shape),)}, hips=None)
+CARM = CArm(CAMERA, (0.0, 0.0, 632.0), (0.0, 1.0, 0.0))
+NAMES = HIP.landmark_names
+SIX = [[75.0, 15, -25], [48, 10, -120], [30, -10, -112], [4, -45, -108], [4, -20, -120], [125, -75, -25]]
+POSE = torch.tensor([[1.0, 0, 0, -30], [0, 0, -1, -80], [0, 1, 0, 740], [0, 0, 0, 1]], dtype=torch.float64)
+
+
+def case_of(landmarks: dict[str, torch.Tensor]) -> Case:
+    return Case(
+        folder=Path("case"),
+        carm=CARM,
+        objects={"pelvis": CaseObject("pelvis", bones=("pelvis",))},
+        views=(View({"anatomy": Path("view1.tif")}),),
+        anatomy=HIP,
+        landmarks=landmarks,
+    )
+
+
+def scene() -> Scene:
+    box = Volume(torch.ones(4, 4, 4), axis_aligned((10.0, 10.0, 10.0), (0.0, 0.0, 0.0)))
+    objects = {"pelvis": RigidObject(box, torch.zeros(3, dtype=torch.float64), ("anatomy",))}
+    image = torch.rand(CAMERA.shape, generator=torch.Generator().manual_seed(3))
+    return Scene(CARM, objects, {"anatomy": (image,)})
+
+
+def hip_case() -> Case:
+    return case_of({name: torch.zeros(3, dtype=torch.float64) for name in NAMES})
 
 
 def detection(visible: int, inverted: bool) -> Detection:
-    seen = torch.arange(len(HIP_LANDMARKS)) < visible
-    ones = torch.ones(len(HIP_LANDMARKS), dtype=torch.float64)
-    pixels = torch.zeros(len(HIP_LANDMARKS), 2, dtype=torch.float64)
-    return Detection(pixels, ones, ones, seen, torch.zeros(7, 96, 96), CAMERA, False, inverted)
+    seen = torch.arange(len(NAMES)) < visible
+    ones = torch.ones(len(NAMES), dtype=torch.float64)
+    pixels = torch.zeros(len(NAMES), 2, dtype=torch.float64)
+    return Detection(pixels, ones, ones, seen, torch.zeros(1 + len(HIP.bones), 96, 96), CAMERA, False, inverted)
 
 
 def test_too_few_landmarks_are_refused() -> None:
     with pytest.raises(InputError, match=r"view1.tif: 3 usable landmarks found, at least 4"):
-        start_from_landmarks(CASE, SCENE, detection(3, inverted=False))
+        start_by_detection(hip_case(), scene(), detection(3, inverted=False))
 
 
 def test_inverted_grey_values_are_refused_however_many_landmarks_there_are() -> None:
     with pytest.raises(InputError, match=r"view1.tif: bone seems to be darker"):
-        start_from_landmarks(CASE, SCENE, detection(14, inverted=True))
+        start_by_detection(hip_case(), scene(), detection(14, inverted=True))
 
 
 def test_a_rotation_left_open_is_refused_where_no_outline_can_mend_it() -> None:
     """Six landmarks of one hip, seen exactly but trusted to some mm only."""
-    six = [[75.0, 15, -25], [48, 10, -120], [30, -10, -112], [4, -45, -108], [4, -20, -120], [125, -75, -25]]
-    points = torch.tensor(six, dtype=torch.float64)
-    landmarks = dict(zip(HIP_LANDMARKS[:6], points, strict=True))
-    pose = torch.tensor([[1.0, 0, 0, -30], [0, 0, -1, -80], [0, 1, 0, 740], [0, 0, 0, 1]], dtype=torch.float64)
+    points = torch.tensor(SIX, dtype=torch.float64)
+    landmarks = dict(zip(NAMES[:6], points, strict=True))
     found = detection(6, inverted=False)
-    found.pixels[:6] = project_points(CAMERA, transform_points(pose, points))
-    start = find_start(landmarks, found, torch.rand(CAMERA.shape), CAMERA, None)
-    assert rotation_angle(start.camera_from_ct[:3, :3] @ pose[:3, :3].mT) < 0.02
+    found.pixels[:6] = project_points(CAMERA, transform_points(POSE, points))
+    start = find_start(landmarks, found, torch.rand(CAMERA.shape), CAMERA, None, HIP)
+    assert rotation_angle(start.camera_from_ct[:3, :3] @ POSE[:3, :3].mT) < 0.02
     vague = replace(found, deviation_px=9 * found.deviation_px)
     with pytest.raises(InputError, match=r"fix the rotation only to \d+°, and no outlines help"):
-        find_start(landmarks, vague, torch.rand(CAMERA.shape), CAMERA, None)
+        find_start(landmarks, vague, torch.rand(CAMERA.shape), CAMERA, None, HIP)
+
+
+def test_landmarks_picked_by_hand_place_the_first_object() -> None:
+    points = torch.tensor([*SIX, [-75.0, 15, -25], [-125, -75, -25]], dtype=torch.float64)
+    names = [*NAMES[:6], "FH-x", "ASIS-x"]  # names of the user's own
+    case = case_of(dict(zip(names, points, strict=True)))
+    pixels = dict(zip(names, project_points(CAMERA, transform_points(POSE, points)), strict=True))
+    start = start_by_landmarks(case, "pelvis", pixels)
+    torch.testing.assert_close(start.camera1_from_object, POSE, atol=0.05, rtol=0)
+    assert start.object == "pelvis"
+    assert all(mark.used for mark in start.landmarks.values())
+    wrong = pixels | {names[0]: pixels[names[0]] + 90}
+    outlier = start_by_landmarks(case, "pelvis", wrong)
+    assert [name for name, mark in outlier.landmarks.items() if not mark.used] == [names[0]]
+    torch.testing.assert_close(outlier.camera1_from_object[:3, 3], POSE[:3, 3], atol=3.0, rtol=0)
+
+
+def test_too_few_landmarks_by_hand_are_refused() -> None:
+    case = case_of(dict(zip(NAMES[:6], torch.tensor(SIX, dtype=torch.float64), strict=True)))
+    pixels = {name: torch.zeros(2, dtype=torch.float64) for name in (*NAMES[:3], "knee", "ankle")}
+    with pytest.raises(InputError, match="3 have the name of a landmark of the case"):
+        start_by_landmarks(case, "pelvis", pixels)

@@ -10,17 +10,18 @@ from torch import Tensor
 from femoreg_torch.detect import Detection
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera
-from femoreg_torch.registration import Scene
-from femoreg_torch.registration.objective import Level, image_costs
-from femoreg_torch.registration.scene import Body, Segmentation
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import image_costs
+from femoreg_torch.registration.scene import Body, Scene, Segmentation
 from femoreg_torch.registration.start import with_segmentations
 from femoreg_torch.registration.weights import Weighting, pixel_weights
+from femoreg_torch.similarity import GradNcc
 
 TRUTH = true_poses()
 ANATOMY = ("pelvis", "femur")
 ALL = (*ANATOMY, "device")
-LEVEL = Level(downsample=1, step_mm=2.0, patch_radius=4)
-SMALL = Level(downsample=1, step_mm=2.0, patch_radius=1)
+LEVEL = Level(pixel_mm=3.0, step_mm=2.0)
+SMALL = GradNcc(patch_radius=1)
 REACH = 2 + 3  # pixels: a patch that weighs a little at one end, and the kernel of the derivatives
 
 
@@ -107,7 +108,7 @@ def test_what_happens_where_no_pixel_counts_does_not_matter(scene: Scene, kind: 
     deltas = torch.eye(6, dtype=torch.float64)
 
     def costs(of: Scene, by: list[Weighting]) -> Tensor:
-        return image_costs(of, TRUTH, (body,), render, [(kind, 1)], SMALL, by)(deltas)  # type: ignore[list-item]
+        return image_costs(of, TRUTH, (body,), render, [(kind, 1)], LEVEL, SMALL, by)(deltas)  # type: ignore[list-item]
 
     torch.testing.assert_close(costs(scene, weights), costs(disturbed, weights), rtol=0, atol=1e-9)  # type: ignore[arg-type]
     assert (costs(scene, []) - costs(disturbed, [])).abs().max() > 1e-4
@@ -123,9 +124,9 @@ def test_an_image_of_which_nothing_is_left_is_named(scene: Scene) -> None:
     with pytest.raises(
         InputError, match=r"^view 3, anatomy image: weights \[bones\] leave no pixel .*pelvis, femur.*$"
     ):
-        image_costs(blind, TRUTH, (body,), ANATOMY, images, LEVEL, ["bones"])  # type: ignore[arg-type]
+        image_costs(blind, TRUTH, (body,), ANATOMY, images, LEVEL, SMALL, ["bones"])  # type: ignore[arg-type]
     with pytest.raises(InputError, match="has no segmentations"):
-        image_costs(make_scene(TRUTH), TRUTH, (body,), ANATOMY, images, LEVEL, ["bones"])  # type: ignore[arg-type]
+        image_costs(make_scene(TRUTH), TRUTH, (body,), ANATOMY, images, LEVEL, SMALL, ["bones"])  # type: ignore[arg-type]
 
 
 def test_the_network_looks_once_at_every_view(scene: Scene) -> None:

@@ -1,0 +1,167 @@
+"""Objects of a case that are written out: where each comes from, and how it starts."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.anatomy import Anatomy, LabelTable
+from femoreg_torch.anatomy.tables import label_ids
+from femoreg_torch.case.fields import Fields
+from femoreg_torch.case.model import CaseObject, Model, PlannedPath, Start
+from femoreg_torch.errors import InputError
+
+VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")  # of a model given as voxels
+_BY_LANDMARKS = "landmarks"
+_RESERVED = ("all", "each", "view", "views", "camera1")  # words of presets, and of names of poses
+
+
+def read_object(
+    entries: Fields,
+    name: str,
+    folder: Path,
+    bones: LabelTable,
+    anatomy: Anatomy | None,
+    landmarks: Mapping[str, Tensor],
+) -> CaseObject:
+    """One entry of `objects`: bones of the CT's label map, or a model, with points, images and start.
+
+    Raises `InputError` that names file and key for whatever does not fit.
+    """
+    entry = entries.mapping(name).only(
+        "bones", "model", "volume", "labels", "hu", "reference", "points", "images", "start"
+    )
+    if not name.isidentifier() or name in _RESERVED:
+        raise InputError(
+            f"{entries.where(name)}: a name of letters, digits and _ was expected, other than {', '.join(_RESERVED)}; "
+            "poses are named after it."
+        )
+    points = {}
+    if "points" in entry:
+        named = entry.mapping("points")
+        points = {key: named.point(key) for key in named.content}
+    from_ct = "bones" in entry
+    if from_ct == ("model" in entry or "volume" in entry):
+        raise InputError(f"{entries.where(name)}: either `bones` of the CT or a `model` or `volume` was expected.")
+    return CaseObject(
+        name=name,
+        bones=_bones(entry, bones, anatomy) if from_ct else (),
+        model=None if from_ct else read_model(entry, folder),
+        reference=_reference(entry, points, landmarks if from_ct else {}),
+        points=points,
+        images=tuple(entry.texts("images", "a kind of images, or a list")) if "images" in entry else None,
+        start=_start(entry),
+    )
+
+
+def _bones(entry: Fields, bones: LabelTable, anatomy: Anatomy | None) -> tuple[str, ...]:
+    names = entry.texts("bones", "the name of a bone, or a list")
+    for name in names:
+        inside = anatomy.groups.get(name, (name,)) if anatomy else (name,)
+        if name not in bones and not any(bone in bones for bone in inside):
+            raise InputError(
+                f"{entry.where('bones')}: `ct.bones` has no {name!r}. It has: {', '.join(bones) or 'nothing'}."
+            )
+    return tuple(names)
+
+
+def _reference(entry: Fields, points: Mapping[str, Tensor], landmarks: Mapping[str, Tensor]) -> Tensor | None:
+    if "reference" not in entry:
+        return None
+    value = entry.value("reference", "a point's name or [x, y, z]")
+    if not isinstance(value, str):
+        return entry.point("reference")
+    known = {**landmarks, **points}
+    if value not in known:
+        raise InputError(
+            f"{entry.where('reference')}: there is no point {value[:60]!r}. There are: {', '.join(known)}."
+        )
+    return known[value]
+
+
+def _start(entry: Fields) -> Start:
+    if entry.value("start", "landmarks, {beside: …} or {camera1_from: …}") == _BY_LANDMARKS:
+        return Start()
+    start = entry.mapping("start").only("beside", "beside_from_object", "camera1_from")
+    if ("beside" in start) == ("camera1_from" in start):
+        raise InputError(f"{entry.where('start')}: either `beside` or `camera1_from` was expected.")
+    if "camera1_from" in start:
+        if "beside_from_object" in start:
+            raise InputError(
+                f"{start.where('beside_from_object')}: only an object that starts `beside` another has it."
+            )
+        return Start(camera1_from=start.transform("camera1_from"))
+    beside = start.text("beside", "the name of another object")
+    if "beside_from_object" not in start:
+        return Start(beside=beside)
+    return Start(beside=beside, beside_from_object=start.transform("beside_from_object"))
+
+
+def read_model(entry: Fields, folder: Path) -> Model:
+    """The mesh under `model`, or the `volume` with its `labels`; `hu` is the material's. Raises `InputError`."""
+    path, labels = _model_file(entry, folder)
+    return Model(path, entry.number("hu") if "model" in entry or labels else None, labels)
+
+
+def _model_file(entry: Fields, folder: Path) -> tuple[Path, tuple[int, ...] | None]:
+    """The mesh or the volume, and the labels of its voxels if it is a labelled volume."""
+    if "model" in entry and "volume" in entry:
+        raise InputError(f"{entry.where('volume')}: `model` (a mesh) is given too. Keep one of the two.")
+    if "volume" not in entry:
+        if "labels" in entry:
+            raise InputError(f"{entry.where('labels')}: only a `volume` has labels, found `model` (a mesh).")
+        path = entry.file_path("model", folder)
+        if path.name.lower().endswith(VOLUME_SUFFIXES):
+            raise InputError(f"{entry.where('model')}: a mesh was expected, found {path.name}. Give it as `volume`.")
+        return path, None
+    path = entry.file_path("volume", folder)
+    if not path.name.lower().endswith(VOLUME_SUFFIXES):
+        raise InputError(
+            f"{entry.where('volume')}: a volume ({', '.join(VOLUME_SUFFIXES)}) was expected, found {path.name}. "
+            "Give a mesh as `model`."
+        )
+    if "labels" in entry:
+        return path, label_ids(entry.value("labels", "a list of label ids"), entry.where("labels"))
+    if "hu" in entry:
+        raise InputError(
+            f"{entry.where('hu')}: a `volume` without `labels` holds HU itself. Name the labels, or drop `hu`."
+        )
+    return path, None
+
+
+def read_plan(plan: Fields, objects: Mapping[str, CaseObject], landmarks: Mapping[str, Tensor]) -> PlannedPath:
+    """The planned path of a case whose objects are written out. Raises `InputError`."""
+    plan.only("object", "entry_point", "target", "tool")
+    name = plan.choice("object", tuple(objects))
+    tool = plan.choice("tool", tuple(objects)) if "tool" in plan else None
+    if tool is not None and not {"tip", "base"} <= set(objects[tool].points):
+        raise InputError(
+            f"{plan.where('tool')}: {tool} needs the points `tip` and `base`; its guide runs from base to tip."
+        )
+    if tool is not None:
+        check_guide(objects[tool].points, f"{plan.where('tool')}: {tool}")
+    target = plan.value("target", "a landmark or a point [x, y, z]")
+    if isinstance(target, str):
+        known = {**landmarks, **objects[name].points}
+        if target not in known:
+            raise InputError(
+                f"{plan.where('target')}: there is no point {target[:60]!r}. There are: {', '.join(known)}."
+            )
+        end = known[target]
+    else:
+        end = plan.point("target")
+    return checked_path(PlannedPath(name, plan.point("entry_point"), end, tool), plan)
+
+
+def checked_path(path: PlannedPath, plan: Fields) -> PlannedPath:
+    """The path, if it has a direction. Raises `InputError`."""
+    if not (path.target - path.entry_point).norm() > 1e-6:
+        raise InputError(f"{plan.where('entry_point')}: is the target itself, so the path has no direction.")
+    return path
+
+
+def check_guide(points: Mapping[str, Tensor], where: str) -> None:
+    """Raises `InputError` that starts with `where` if tip and base are one point."""
+    if torch.equal(points["tip"], points["base"]):
+        raise InputError(f"{where}: tip and base are the same point, so the guide has no direction.")

@@ -1,0 +1,169 @@
+"""The parts of `case.yaml` that every form of a case has: anatomy, label table, C-arm, views, truth."""
+
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.anatomy import Anatomy, LabelTable, bone_of_name, label_table, load_anatomy
+from femoreg_torch.anatomy.tables import label_ids
+from femoreg_torch.case.fields import Fields
+from femoreg_torch.case.model import Intensity, View
+from femoreg_torch.case.poses import poses_from
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import read_json
+from femoreg_torch.geometry import CArm, Poses, carm_from_dict, load_carm
+from femoreg_torch.volume.segments import segment_names
+
+ONE_KIND = "image"  # the kind of images where a view has one alone
+
+
+def read_anatomy_and_bones(top: Fields, folder: Path) -> tuple[Anatomy | None, LabelTable]:
+    """The body part, if one is named, and which ids of the label map are which bones."""
+    anatomy = None
+    if "anatomy" in top:
+        name = top.text("anatomy", "the name of an anatomy, as hip, or a YAML file")
+        try:
+            anatomy = load_anatomy(folder / name if name.endswith((".yaml", ".yml")) else name)
+        except InputError as error:
+            raise InputError(f"{top.where('anatomy')}: {error}") from error
+    if "ct" not in top:
+        return anatomy, {}
+    ct = top.mapping("ct")
+    if "labels" not in ct:
+        return anatomy, {}
+    return anatomy, read_bones(ct, folder, anatomy)
+
+
+def read_bones(ct: Fields, folder: Path, anatomy: Anatomy | None) -> LabelTable:
+    """Ids by bone under `bones`: a table's name, a table's YAML file, or a mapping of bones to ids.
+
+    For a segmentation of 3D Slicer (`.seg.nrrd`) the names of its segments say it. Raises `InputError`.
+    """
+    where = ct.where("bones")
+    if "bones" not in ct:
+        path = ct.file_path("labels", folder)
+        if not path.name.lower().endswith(".seg.nrrd"):
+            raise InputError(
+                f"{where}: missing. Name the table of the label map (femoreg, totalsegmentator_v2, …), or its ids by "
+                "bone: {hip_left: 1, …}."
+            )
+        return _bones_of_segments(path, anatomy, where)
+    value = ct.value("bones", "a table of label ids")
+    if isinstance(value, dict):
+        table = {str(bone): label_ids(ids, f"{where}.{bone}") for bone, ids in value.items()}
+    elif isinstance(value, str):
+        try:
+            table = label_table(folder / value if value.endswith((".yaml", ".yml")) else value)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
+    else:
+        raise InputError(f"{where}: the name of a table or {{bone: id, …}} was expected, found {type(value).__name__}.")
+    return _checked_table(table, anatomy, where)
+
+
+def _bones_of_segments(path: Path, anatomy: Anatomy | None, where: str) -> LabelTable:
+    """Ids by bone of a segmentation whose segments have names; segments that are no bones are left out."""
+    segments = segment_names(path)
+    if anatomy is None:
+        return segments
+    table: LabelTable = {}
+    for text, ids in segments.items():
+        bone = bone_of_name(anatomy, text)
+        if bone is not None:
+            table[bone] = (*table.get(bone, ()), *ids)
+    if not table:
+        known = ", ".join(anatomy.bone_names)
+        raise InputError(
+            f"{where}: no segment of {path.name} is named after a bone; there are: {', '.join(segments)[:200]}. Rename "
+            f"them in 3D Slicer ({known}), or give their label values here."
+        )
+    return table
+
+
+def _checked_table(table: LabelTable, anatomy: Anatomy | None, where: str) -> LabelTable:
+    """The table, if every name is known and no id belongs to two bones other than to both sides of one."""
+    if anatomy is not None:
+        try:
+            anatomy.members(*table)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
+    taken: dict[int, str] = {}
+    for bone, ids in table.items():
+        for n in ids:
+            other = taken.setdefault(n, bone)
+            both_sides = anatomy and bone in anatomy.bone_names and anatomy.bone(bone).mirror == other
+            if other != bone and not both_sides:
+                raise InputError(f"{where}.{bone}: label {n} belongs to {other} already.")
+    return table
+
+
+def read_carm(top: Fields) -> CArm:
+    """The C-arm under `carm`: a preset's name, a YAML file beside `case.yaml`, or its settings."""
+    value: Any = top.value("carm", "the name of a C-arm preset, a YAML file, or {sdd_mm, pixel_mm, shape}")
+    if isinstance(value, dict):
+        return carm_from_dict(value, top.where("carm"))
+    name = top.text("carm", "the name of a C-arm preset, a YAML file, or {sdd_mm, pixel_mm, shape}")
+    try:
+        return load_carm(str(Path(top.file).parent / name) if name.endswith((".yaml", ".yml")) else name)
+    except InputError as error:
+        raise InputError(f"{top.where('carm')}: {error}") from error
+
+
+def read_view(view: Fields, folder: Path) -> View:
+    """A view with `image`, or with `images` by kind."""
+    view.only("image", "images", "intensity", "camera_from_camera1")
+    if "images" in view and "image" in view:
+        raise InputError(f"{view.where('image')}: `images` is given too. Keep one of the two.")
+    if "images" in view:
+        by_kind = view.mapping("images")
+        images = {str(kind): by_kind.file_path(kind, folder) for kind in by_kind.content}
+    else:
+        images = {ONE_KIND: view.file_path("image", folder)}
+    if not images:
+        raise InputError(f"{view.where('images')}: is empty. Name at least one image.")
+    return View(images, read_intensity(view), read_known_pose(view))
+
+
+def read_intensity(view: Fields) -> Intensity:
+    """What the values of a view's images are."""
+    return cast(Intensity, view.choice("intensity", ("raw", "log")) if "intensity" in view else "raw")
+
+
+def read_known_pose(view: Fields) -> Tensor | None:
+    """`camera_from_camera1` (4, 4) of a view, or None where it is to be found."""
+    return view.transform("camera_from_camera1") if "camera_from_camera1" in view else None
+
+
+def with_known_poses(views: tuple[View, ...], top: Fields) -> tuple[View, ...]:
+    """The views, if the C-arm's pose is known in all of them (that of the first may be left out) or in none."""
+    known = [number for number, view in enumerate(views) if view.camera_from_camera1 is not None]
+    if not known:
+        return views
+    first = views[0].camera_from_camera1
+    if first is not None and not torch.allclose(first, torch.eye(4, dtype=torch.float64), atol=1e-6):
+        raise InputError(f"{top.where('views[0].camera_from_camera1')}: the first view is camera 1: leave it out.")
+    for number, view in enumerate(views[1:], 1):
+        if view.camera_from_camera1 is None:
+            raise InputError(
+                f"{top.where(f'views[{number}].camera_from_camera1')}: missing, while views[{known[0]}] has it. Give "
+                "the C-arm's pose of every view, or of none."
+            )
+    return views
+
+
+def read_truth(top: Fields, folder: Path, objects: list[str], views: int) -> Poses | None:
+    """Known poses of all objects, or None."""
+    if "truth" not in top:
+        return None
+    path = top.file_path("truth", folder)
+    anchor, *others = objects
+    known = (f"camera_from_{anchor}", *(f"camera1_from_{name}" for name in others))
+    fields = Fields(read_json(path), str(path)).only(*known)
+    truth = poses_from(fields, anchor, others)
+    if views and len(truth.camera_from_camera1) != views:
+        raise InputError(
+            f"{fields.where(known[0])}: {len(truth.camera_from_camera1)} poses, but the case has {views} views."
+        )
+    return truth

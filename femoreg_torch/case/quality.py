@@ -1,0 +1,27 @@
+"""What was measured at a solution about every object in every view, and whether it is trusted."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ViewQuality:
+    """One object in one image."""
+
+    view: int  # from 1
+    similarity: float  # of the image with all objects drawn: mean patch Grad-NCC, at most 1
+    gain: float  # what drawing this object adds to it
+    pull_mm: tuple[float, float]  # where this view alone would move the object, along its columns and rows
+
+
+@dataclass(frozen=True)
+class ObjectQuality:
+    """One object in all views."""
+
+    views: tuple[ViewQuality, ...]
+    in_plane_uncertainty_mm: float  # root mean square disagreement of the views in their image planes
+    common_pull: tuple[float, float]  # degrees, mm: where all images together would move it, were all free
+    rotation_deviation_deg: tuple[float, ...]  # standard deviations about the axes of camera 1
+    translation_deviation_mm: tuple[float, ...]  # and along them, of the reference point
+    displacement: tuple[float, float] | None  # degrees, mm from where it was expected, at the reference point
+    trusted: bool
+    reason: str

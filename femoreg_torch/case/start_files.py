@@ -1,0 +1,73 @@
+"""Files that start a registration by hand: landmarks in the first image, and start poses."""
+
+import csv
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.case.fields import Fields
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import read_json
+from femoreg_torch.volume import read_landmarks
+
+COLUMNS = ("landmark", "column_px", "row_px")
+_POSE = "camera1_from_"
+
+
+def read_pixels(path: Path) -> dict[str, Tensor]:
+    """Landmarks (2,), column and row in pixels of the image as stored, by name.
+
+    A CSV file with the columns landmark, column_px and row_px; where it has a column `visible`, rows with 0 are left
+    out, and where it has a column `image`, all rows must be of one image. Or 3D Slicer markups and `.fcsv` files of the
+    image plane: x is the column, y the row, in the space LPS. Raises `InputError` that names file and row.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    if path.suffix.lower() != ".csv":
+        return {name: point[:2] for name, point in read_landmarks(path, None).items()}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
+    if not rows or not set(COLUMNS) <= set(rows[0]):
+        raise InputError(f"{path}: a header with {', '.join(COLUMNS)}, and rows below it, were expected.")
+    if len(images := {row.get("image") for row in rows}) > 1:
+        raise InputError(f"{path}: holds landmarks of {len(images)} images. Keep the rows of the first view.")
+    found: dict[str, Tensor] = {}
+    for number, row in enumerate(rows, 2):
+        name = row["landmark"]
+        if row.get("visible", "1") in ("0", "False", "false"):
+            continue
+        if not name or name in found:
+            raise InputError(f"{path}, line {number}: the name of a landmark was expected, each once; found {name!r}.")
+        try:
+            pixel = torch.tensor([float(row["column_px"]), float(row["row_px"])], dtype=torch.float64)
+        except (TypeError, ValueError):
+            pixel = torch.full((2,), torch.nan)
+        if not torch.isfinite(pixel).all():
+            raise InputError(f"{path}, line {number}: two finite numbers, column_px and row_px, were expected.")
+        found[name] = pixel
+    if not found:
+        raise InputError(f"{path}: no row is visible.")
+    return found
+
+
+def read_start_poses(path: Path) -> dict[str, Tensor]:
+    """Poses (4, 4) in camera 1 of objects by name, from the entries `camera1_from_<object>` of a JSON file.
+
+    In a result the first object stands as `camera_from_<object>`, a list of which the first matrix counts. Raises
+    `InputError` if there is no such entry, or one is not rigid.
+    """
+    fields = Fields(read_json(Path(path)), str(path))
+    poses = {
+        key.removeprefix("camera_from_"): fields.transforms(key)[0]
+        for key in fields.content
+        if key.startswith("camera_from_") and key != "camera_from_camera1"
+    }
+    poses |= {key.removeprefix(_POSE): fields.transform(key) for key in fields.content if key.startswith(_POSE)}
+    if not poses:
+        raise InputError(f"{path}: holds no start pose. An entry `{_POSE}<object>`, 4×4 in mm, was expected.")
+    return poses

@@ -1,0 +1,64 @@
+"""A landmark network from its weights file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from torch import nn
+
+from femoreg_torch.anatomy import HIP, Anatomy, load_anatomy
+from femoreg_torch.errors import InputError
+from femoreg_torch.extensions import find
+from femoreg_torch.settings import read_record
+
+NETWORKS_GROUP: Final = "femoreg_torch.networks"  # entry points of other packages' networks, see `models.protocols`
+_SIGMA_PX = 1.25  # of the shipped weights
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkNetwork:
+    """A network in evaluation mode, and what its weights say of it."""
+
+    module: nn.Module  # maps images (B, 1, H, W) to a `models.protocols.Prediction`
+    anatomy: Anatomy = HIP  # the classes are the background and its bones, the heat maps its landmarks
+    sigma_px: float = _SIGMA_PX  # standard deviation of the peak that the heat maps were trained to show
+
+
+def load_network(path: Path | None = None) -> LandmarkNetwork:
+    """The network of a weights file; without a path, the shipped one.
+
+    Raises `InputError` for a file that is missing or holds something else, a kind of network or an anatomy that is not
+    known, and weights that do not fit their network, or a network that does not fit its anatomy.
+    """
+    from models.kinds import NETWORKS
+    from models.weights import SHIPPED_WEIGHTS, read_weights
+
+    where = str(path or SHIPPED_WEIGHTS)
+    try:
+        weights = read_weights(path)
+    except (OSError, ValueError) as error:
+        raise InputError(str(error)) from error
+    try:
+        anatomy = load_anatomy(weights.anatomy)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    settings = read_record(find(NETWORKS_GROUP, weights.kind, NETWORKS, where), weights.settings, where)
+    check_counts(settings.classes, settings.landmarks, anatomy, where)
+    try:
+        module = settings.build()
+        module.load_state_dict(weights.state)
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{where}: the weights do not fit a network {weights.kind} of {settings} ({error})."
+        ) from error
+    return LandmarkNetwork(module.eval(), anatomy, weights.sigma_px)
+
+
+def check_counts(classes: int, landmarks: int, anatomy: Anatomy, where: str) -> None:
+    """Raise `InputError` that starts with `where` unless a network has the classes and landmarks of an anatomy."""
+    expected = (1 + len(anatomy.bones), len(anatomy.landmarks))
+    if (classes, landmarks) != expected:
+        raise InputError(
+            f"{where}: the network has {classes} classes and {landmarks} landmarks, but the anatomy {anatomy.name} has "
+            f"{expected[0]} (the background and {len(anatomy.bones)} bones) and {expected[1]}."
+        )

@@ -1,0 +1,21 @@
+"""Packages that only simulation, training or studies import, and the extra of this distribution that installs them."""
+
+_EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
+    "h5py": "sim",
+    "manifold3d": "sim",
+    "skimage": "sim",
+    "kornia": "train",
+    "lightning": "train",
+    "tensorboard": "train",
+    "joblib": "study",
+    "matplotlib": "all",  # in both `train` and `study`
+}
+
+
+def missing_extra(error: ModuleNotFoundError) -> str | None:
+    """One line that says which extra to install for the module that is missing, or None if none has it."""
+    package = (error.name or "").partition(".")[0]
+    extra = _EXTRA_OF.get(package)
+    if extra is None:
+        return None
+    return f"this needs the package {package}, which is not installed: pip install 'femoreg-torch[{extra}]'."

@@ -1,0 +1,51 @@
+"""Levels count mm on the detector: whatever the binning of the images, the same pixels and nearly the same costs."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from registration_scenes import CARM, REFERENCE_POINTS, float64, make_scene, off, true_poses
+
+from femoreg_torch.fluoro import downsample
+from femoreg_torch.geometry import centred_camera
+from femoreg_torch.registration import Level
+from femoreg_torch.registration.level import binning
+from femoreg_torch.registration.objective import image_costs
+from femoreg_torch.registration.scene import Body
+from femoreg_torch.similarity import GradNcc
+
+
+@pytest.mark.parametrize(
+    ("pixel_mm", "pixels"),
+    [(0.1, 1), (1.0, 1), (1.41, 1), (1.42, 2), (2.44, 2), (2.46, 3), (7.9, 8)],  # √2 and √6 lie half-way
+)
+def test_the_nearest_whole_factor_by_ratio(pixel_mm: float, pixels: int) -> None:
+    assert binning(pixel_mm, centred_camera(1000.0, (1.0, 1.0), (64, 64))) == pixels
+    assert binning(pixel_mm, centred_camera(1000.0, (0.5, 2.0), (64, 64))) == pixels
+
+
+def test_images_binned_two_by_two_with_their_camera_are_seen_alike() -> None:
+    poses = true_poses((0,))
+    scene = make_scene(poses)
+    binned = replace(
+        scene,
+        carm=replace(CARM, camera=CARM.camera.downsampled(2)),
+        images={kind: tuple(downsample(image, 2) for image in images) for kind, images in scene.images.items()},
+    )
+    level = Level(pixel_mm=12, step_mm=2)
+    camera = level.camera(CARM.camera)
+    assert camera == level.camera(binned.carm.camera)
+    assert camera.pixel_mm == (12, 12)
+    finely, coarsely = (level.image(s.images["anatomy"][0], s.carm.camera) for s in (scene, binned))
+    torch.testing.assert_close(finely, coarsely, atol=1e-6, rtol=1e-5)
+    wrong = off(poses.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"], (1, 2, 0), (3, 0, 0))
+    body = Body(("pelvis",), 0, float64(0, 0, 740), float64(0.02, 0.02, 0.02, 2, 2, 12))
+    deltas = torch.eye(6, dtype=torch.float64)
+    one, other = (
+        image_costs(
+            s, poses.with_object("pelvis", wrong), (body,), ["pelvis", "femur"], [("anatomy", 0)], level, GradNcc(2)
+        )(deltas)
+        for s in (scene, binned)
+    )
+    torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
+    assert one.std() > 1e-3
