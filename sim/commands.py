@@ -1,4 +1,4 @@
-"""Commands of the simulated operating room: `femoreg phantom`, `simulate`, `dataset` and `demo`."""
+"""Commands of the simulated operating room: patients, procedures on them, labelled images, and the demo."""
 
 from pathlib import Path
 from typing import Literal
@@ -15,12 +15,65 @@ def phantom(out: Path, *, seed: int = 1, side: Literal["left", "right"] = "left"
     """
     from rich.console import Console
 
-    from sim.writing import write_phantom
+    from sim.theatre.case_folders import write_phantom
 
     console = Console()
     with console.status("building the patient"):
         write_phantom(out, seed, side, spacing_mm)
     console.print(f"Patient {seed} written to {out}")
+
+
+def around_surfaces(
+    surfaces: Path,
+    *,
+    out: Path,
+    seed: int = 7,
+    spacing_mm: float = 1.0,
+    osteoporotic: float = 1.0,
+    below_mm: int = 165,
+) -> None:
+    """Make a patient around real bone surfaces: CT with invented grey values, labels, landmarks.
+
+    Args:
+        surfaces: NumPy archive (.npz) with BONE_vertices and BONE_faces in LPS mm of hip_left, hip_right, sacrum,
+            femur_left and femur_right: closed surfaces, femora of 280 mm below the head or more.
+        out: Folder to write; `femoreg simulate` takes it as its case.
+        seed: The same seed gives the same texture, soft tissue and noise.
+        spacing_mm: Voxel size of the CT, 0.5 or 1; both show the same patient. 0.5 mm needs 8 GB of memory.
+        osteoporotic: 1 for healthy bone, down to 0.1; scales the spongy bone, and the cortex by its square root.
+        below_mm: Femur in the CT below the centres of the heads, 100 to 300.
+    """
+    from rich.console import Console
+
+    from sim.patient.around_surfaces import Options, write_patient_around
+
+    console = Console()
+    with console.status("building the patient"):
+        write_patient_around(surfaces, out, Options(seed, spacing_mm, osteoporotic, below_mm))
+    console.print(f"Patient around {surfaces} written to {out}")
+
+
+def around_labels(label_map: Path, *, out: Path, labels: str, seed: int = 1, spacing_mm: float = 1.0) -> None:
+    """Make a patient around the bones of a label map: CT with invented grey values, labels, landmarks.
+
+    Args:
+        label_map: NIfTI, NRRD or MHA file with whole pelvis and upper femora; its grey values are not needed.
+        out: Folder to write; `femoreg simulate` takes it as its case.
+        labels: Label table that tells the map's ids, in `configs/anatomy/labels` (pelvic_ref, autoseg, …), or a YAML
+            file.
+        seed: The same seed gives the same bone density, soft tissue and noise.
+        spacing_mm: Voxel size of the CT.
+    """
+    from rich.console import Console
+
+    from femoreg_torch.anatomy import label_table
+    from sim.patient.from_labels import write_label_patient
+
+    table = label_table(labels)
+    console = Console()
+    with console.status("building the patient"):
+        write_label_patient(label_map, table, out, seed, spacing_mm)
+    console.print(f"Patient around {label_map} written to {out}")
 
 
 def simulate(
@@ -43,7 +96,7 @@ def simulate(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    from sim.writing import SIMULATION_STEPS, write_simulation
+    from sim.theatre.case_folders import SIMULATION_STEPS, write_simulation
 
     console = Console()
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -66,12 +119,35 @@ def dataset(config: str, *, out: Path) -> None:
     """
     from rich.console import Console
 
-    from sim.deepfluoro import write_dataset
+    from sim.labelled.deepfluoro import write_dataset
 
     console = Console()
     with console.status("reading the settings") as status:
         write_dataset(config, out, lambda source: status.update(f"imaging {source}"))
     console.print(f"Simulated data set written to {out}")
+
+
+def labelled_images(
+    patient: Path, *, out: Path, count: int = 140, seed: int = 1, config: str = "labelled", name: str | None = None
+) -> None:
+    """Render labelled fluoroscopy of one patient, with true poses, for `femoreg measure`.
+
+    Args:
+        patient: Folder with ct.nii.gz, labels.nii.gz and landmarks.json.
+        out: File to write, `.safetensors`; a few seconds for an image.
+        count: Number of views.
+        seed: The same seed gives the same views.
+        config: Preset of `configs/simulation` with views and X-ray settings (labelled), or a YAML file.
+        name: Who it is; the folder's name, if not given. Images of one name count as one patient.
+    """
+    from rich.console import Console
+
+    from sim.labelled.image_files import write_labelled_images
+
+    console = Console()
+    with console.status(f"imaging {patient}"):
+        write_labelled_images(patient, out, config, count, seed, name)
+    console.print(f"{count} labelled images written to {out}")
 
 
 def demo(*, out: Path = Path("out/demo"), seed: int = 1, preset: str = "fast") -> None:

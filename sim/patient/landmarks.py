@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from skimage.morphology import convex_hull_image
 
 from femoreg_torch.errors import InputError
-from sim.patient.sdf import Field
+from sim.patient.distance_field import Field
 from sim.patient.skeleton import SIDES, Skeleton
 
 Points = NDArray[np.float64]

@@ -1,7 +1,6 @@
-"""A procedural patient in the scanner: CT, labels, landmarks. Everything is computed, no data file is read."""
+"""The CT scan of a skeleton in soft tissue, and its label map."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -9,25 +8,21 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
-from femoreg_torch.volume import HIP_LANDMARKS
 from femoreg_torch.volume.grid import Volume, axis_aligned
-from sim.patient.bone import Axes, bone_hu
-from sim.patient.landmarks import find_landmarks
-from sim.patient.parameters import PatientParameters, draw_parameters
-from sim.patient.sdf import Array
-from sim.patient.skeleton import LABELS, Skeleton, build_skeleton
-from sim.patient.tissue import AIR_HU, SoftTissue, make_soft_tissue
+from sim.patient.bone_hu import Axes, bone_hu
+from sim.patient.distance_field import Array
+from sim.patient.parameters import PatientParameters
+from sim.patient.skeleton import LABEL_IDS, Skeleton
+from sim.patient.soft_tissue import AIR_HU, SoftTissue, make_soft_tissue
 
 Points = NDArray[np.float64]
-BELOW_MM = 190.0  # femur in the scan below the heads
 BLUR_MM = 0.5  # standard deviation of the scanner's point spread
 NOISE_HU = 15.0  # at 1 mm; noise falls with the square root of the voxel size
 
 
 @dataclass(frozen=True, eq=False)
 class Patient:
-    """One synthetic patient; landmarks (3,) float64 LPS mm in the order of `HIP_LANDMARKS`."""
+    """One synthetic patient; landmarks (3,) float64 LPS mm in the order of the anatomy's."""
 
     ct: Volume
     labels: Volume
@@ -70,7 +65,7 @@ def _place_bones(
         part, part_hu = bone_hu(name, field, part_axes, spacing, skeleton, parameters, np.random.default_rng(seed))
         room = 1 - filled[box]  # where two bones share a voxel they cannot fill more than all of it
         share = np.minimum(part, room) / np.maximum(part, 1e-6)
-        labels[box][(part >= 0.5) & (part > filled[box])] = LABELS[name]
+        labels[box][(part >= 0.5) & (part > filled[box])] = LABEL_IDS[name]
         filled[box] += part * share
         hu[box] += part_hu * share
     return hu, filled, labels
@@ -94,38 +89,6 @@ def _scan(hu: Array, filled: Array, axes: Axes, spacing: float, tissue: SoftTiss
     np.clip(np.rint(hu, out=hu), -1024, 3071, out=hu)
 
 
-def make_patient(seed: int, spacing_mm: float = 1.0) -> Patient:
-    """Patient of one seed: the same seed gives the same bits, and the same patient at every voxel size.
-
-    Args:
-        seed: not negative.
-        spacing_mm: voxel size, 0.5 to 2 mm.
-
-    Returns:
-        CT in HU and labels (1 left hip, 2 right, 3 vertebrae, 4 sacrum, 5 left femur, 6 right) on one grid
-        along the LPS axes, whose origin lies midway between the femoral heads; landmarks in LPS mm; parameters.
-    """
-    return make_scans(seed, (spacing_mm,))[0]
-
-
-def make_scans(seed: int, spacings_mm: Sequence[float]) -> list[Patient]:
-    """The patient of one seed at several voxel sizes, as `make_patient` gives each."""
-    if seed < 0:
-        raise InputError(f"patient: seed is {seed}, expected 0 or more.")
-    for spacing_mm in spacings_mm:
-        if not 0.5 <= spacing_mm <= 2:
-            raise InputError(f"patient: spacing is {spacing_mm} mm, expected 0.5 to 2 mm.")
-    shape_seed, *scan_seeds = np.random.SeedSequence(seed).spawn(3 + len(LABELS))
-    shape_rng = np.random.default_rng(shape_seed)
-    parameters = draw_parameters(shape_rng)
-    skeleton = build_skeleton(parameters, shape_rng)
-    landmarks = find_landmarks(skeleton)
-    points = {name: torch.from_numpy(landmarks[name].copy()) for name in HIP_LANDMARKS}
-    numbers = {k: float(v) for k, v in asdict(parameters).items()}
-    scans = [scan_skeleton(skeleton, parameters, -BELOW_MM, scan_seeds, spacing_mm) for spacing_mm in spacings_mm]
-    return [Patient(ct, labels, points, numbers) for ct, labels in scans]
-
-
 def scan_skeleton(
     skeleton: Skeleton,
     parameters: PatientParameters,
@@ -133,10 +96,10 @@ def scan_skeleton(
     seeds: list[np.random.SeedSequence],
     spacing_mm: float,
 ) -> tuple[Volume, Volume]:
-    """CT in HU and labels (as in `LABELS`) of a skeleton in soft tissue, down to `bottom_mm` from the femoral heads.
+    """CT in HU and labels (by `LABEL_IDS`) of a skeleton in soft tissue, down to `bottom_mm` from the femoral heads.
 
     Of `parameters` the bone density, the cortex and the habitus count; `seeds` are those of soft tissue, noise, and
-    each bone's texture.
+    the texture of each bone.
     """
     tissue_seed, noise_seed, *bone_seeds = seeds
     lo, hi = _box(skeleton, parameters, bottom_mm)

@@ -38,7 +38,7 @@ def cases(
         kind: patients to take.
         out: folder that holds, or will hold, `cases/`.
         patients: CTs around real bone shapes; OUT/patients if not given.
-        data: real bone shapes; the environment's FEMOREG_DATA, if set.
+        data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
         jobs: cases made at the same time, on one core each; a case needs some gigabytes of memory.
     """
     study, chosen, stores = _chosen(first, kind, out, patients, data)
@@ -65,7 +65,7 @@ def accuracy(
         kind: patients to take.
         out: folder of cases and results.
         patients: CTs around real bone shapes; OUT/patients if not given.
-        data: real bone shapes; the environment's FEMOREG_DATA, if set.
+        data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
         jobs: registrations at the same time, on one core each; one alone may use all cores.
         reuse: take results that are there although code or plan have changed since (those of the same code always are).
         timed: time the whole command `femoreg register` on so many of the procedures, one after the other.
@@ -100,7 +100,7 @@ def capture_range(
         kind: patients to take.
         out: folder of cases and results.
         patients: CTs around real bone shapes; OUT/patients if not given.
-        data: real bone shapes; the environment's FEMOREG_DATA, if set.
+        data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
         docs: folder of the page that is to be renewed.
     """
     study, chosen, stores = _chosen(first, kind, out, patients, data)
@@ -129,7 +129,7 @@ def trust(
         kind: patients to take.
         out: folder of cases and results.
         patients: CTs around real bone shapes; OUT/patients if not given.
-        data: real bone shapes; the environment's FEMOREG_DATA, if set.
+        data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
         docs: folder of the page that is to be renewed.
     """
     study, chosen, stores = _chosen(first, kind, out, patients, data)
@@ -139,7 +139,7 @@ def trust(
 
 
 def ablation(
-    variants_file: Path = Path("configs/study/ablation.yaml"),
+    variants_file: str = "ablation",
     first: int = 8,
     kind: Kind = "all",
     out: Path = _OUT,
@@ -151,12 +151,12 @@ def ablation(
     """Variants of a plan on the same procedures, in one table.
 
     Args:
-        variants_file: YAML file of variants.
+        variants_file: preset of configs/study, or a YAML file of variants.
         first: procedures to take.
         kind: patients to take.
         out: folder of cases and results.
         patients: CTs around real bone shapes; OUT/patients if not given.
-        data: real bone shapes; the environment's FEMOREG_DATA, if set.
+        data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
         jobs: registrations at the same time, on one core each.
         docs: folder of the page that is to be renewed.
     """

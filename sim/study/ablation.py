@@ -1,16 +1,16 @@
-"""What each part of a plan is worth: variants of it on the same procedures, a row of means for each."""
+"""Ablation: variants of a plan on the same procedures, a row of mean errors for each."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
 from femoreg_torch.configs import load_preset
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.registration import Plan
 from femoreg_torch.registration.plan import plan_from
+from femoreg_torch.settings import read_record
 from sim.study.page import machine, number, table, write_section
 from sim.study.quantities import QUANTITIES
 from sim.study.summary import Record, confusion, relative_is_wrong, statistics
@@ -29,17 +29,23 @@ class Variant:
     views: int | None = None  # the first so many; all if None
 
 
-def read_variants(path: Path) -> list[Variant]:
-    """The variants that stand in a YAML file, in order. Raises `InputError` for a file that is not of that kind."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file. Give a YAML file such as configs/study/ablation.yaml.")
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    if not isinstance(content, dict) or not isinstance(content.get("variants"), list):
-        raise InputError(f"{path}: a list under `variants` was expected.")
-    try:
-        return [Variant(**({"preset": content.get("preset")} | entry)) for entry in content["variants"]]
-    except TypeError as error:
-        raise InputError(f"{path}: {error}. Keys of a variant: name, preset, without, change, views.") from error
+@dataclass(frozen=True)
+class _Variants:
+    """What `configs/study/ablation.yaml` holds."""
+
+    variants: list[dict[str, Any]]
+    preset: str | None = None  # of the variants that name none
+
+
+def read_variants(name: str | Path) -> list[Variant]:
+    """The variants of a preset in `configs/study/` or of a YAML file. Raises `InputError` that names the key."""
+    where = f"variants {name}"
+    content = read_record(_Variants, load_preset("study", name), where)
+    shared = {} if content.preset is None else {"preset": content.preset}
+    return [
+        read_record(Variant, shared | entry, f"{where}, variants[{number}]")
+        for number, entry in enumerate(content.variants, 1)
+    ]
 
 
 def plan_of(variant: Variant) -> Plan:
@@ -82,11 +88,11 @@ def ablation_table(rows: Sequence[Sequence[str]]) -> str:
     return table(("variant", *names, "relative ≤ 4 mm", "wrong, trusted", "evaluations", "s"), rows)
 
 
-def write_ablation(rows: Sequence[Sequence[str]], procedures: int, source: Path, docs: Path | None) -> str:
+def write_ablation(rows: Sequence[Sequence[str]], procedures: int, source: str, docs: Path | None) -> str:
     """The section of the ablation, put into `docs` if given."""
     text = "\n\n".join(
         [
-            f"`make ablation`: the variants of `{source.as_posix()}` on the first {procedures} simulated procedures; "
+            f"`make ablation`: the variants `{source}` on the first {procedures} simulated procedures; "
             "mean errors of the runs that gave poses, evaluations (mean) and seconds of registration (median, taken "
             "along the way).",
             ablation_table(rows),

@@ -258,7 +258,7 @@ def _doubtful(records: Sequence[Record]) -> Iterable[str]:
             continue
         found = record["errors"]
         poses = [f"{found[key]['mm']:.2f} mm, {found[key]['deg']:.2f}°" for key in OBJECTS]
-        why = "; ".join(q["reason"] for q in record["quality"].values() if not q["trusted"])
+        why = "; ".join(record["reasons"])
         says = "trusted" if record["trusted"] else "flagged"
         rows.append([name, *poses, f"{found['relative_mm']:.2f} mm", says, why or "–"])
     return ["Every run that is wrong or flagged:", table(header, rows)]

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from femoreg_torch.case import Truth, read_case
+from femoreg_torch.case import read_case
+from femoreg_torch.case.femoroplasty import PELVIS
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import errors, reference_points
 from femoreg_torch.files import write_json
@@ -84,8 +85,7 @@ def sweep_starts(cases: Sequence[Path], plan: Plan, starts: int) -> list[dict[st
         one_view = replace(case, views=case.views[:1])
         scene = prepare_scene(one_view)
         points = reference_points(case)
-        true = case.truth.camera_from_pelvis[:1]
-        truth = Truth(true, case.truth.camera1_from_femur)
+        truth = case.truth.first_views(1)
         for sweep in AXIS_LABELS:
             for level, share in enumerate((0.0, *LEVELS)):
                 if share == 0 and sweep != "rotation":
@@ -93,10 +93,10 @@ def sweep_starts(cases: Sequence[Path], plan: Plan, starts: int) -> list[dict[st
                 by = offset(sweep, share)
                 for start in range(number, starts, len(cases)):
                     generator = torch.Generator().manual_seed(1000 * level + start)
-                    pose = displaced(true[0], scene.objects["pelvis"].reference_point, by, generator)
+                    centre = scene.objects[PELVIS].reference_point
+                    pose = displaced(truth.camera1_from[PELVIS], centre, by, generator)
                     poses = run_plan(scene, plan, pose, start, lambda *_: None).poses
-                    found = Truth(poses.camera_from("pelvis")[:1], poses.camera1_from["femur"])
-                    row = errors(truth, found, points)["pelvis"]
+                    row = errors(truth, poses, points)[PELVIS]
                     records.append({"sweep": sweep, "share": share, "case": folder.name, **asdict(by), "pelvis": row})
             print(f"{folder.name}: {sweep} done", flush=True)
     return records

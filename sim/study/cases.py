@@ -1,9 +1,6 @@
 """The case folders of a study, made once and kept: the images depend on nothing but the procedure and the settings."""
 
 import shutil
-import subprocess
-import sys
-import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,8 +11,9 @@ from femoreg_torch.configs import load_preset
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import plain, read_json, write_json
+from sim.patient.around_surfaces import Options, write_patient_around
 from sim.study.procedures import Procedure, Study
-from sim.writing import write_procedural_simulation, write_simulation
+from sim.theatre.case_folders import write_procedural_simulation, write_simulation
 
 # Voxels of the CT in the case, and of those that the images are made from.
 REGISTERED_MM = 1.0
@@ -30,7 +28,7 @@ class Stores:
 
     cases: Path
     patients: Path  # CTs built around real bone shapes
-    data: Path  # meshes of real bones; beside it, `tools` with make_ct.py
+    data: Path  # `meshes/SUBJECT.npz` of the real bones
 
     def case(self, procedure: Procedure) -> Path:
         """Where the case of a procedure stands."""
@@ -83,25 +81,17 @@ def make_case_alone(procedure: Procedure, study: Study, stores: Stores) -> None:
 def subject_folder(subject: str, spacing_mm: float, stores: Stores) -> Path:
     """CT, labels and landmarks around the bones of a subject, made unless they are there.
 
-    Raises `InputError` if the meshes or the tool that builds the CT are missing, or the tool fails.
+    Raises `InputError` if the bones are missing.
     """
     folder = stores.patients / subject / f"{spacing_mm:.1f}"
     if folder.is_dir():
         return folder
-    tool, mesh = stores.data.parent / "tools" / "make_ct.py", stores.data / "meshes" / f"{subject}.npz"
-    for path in (tool, mesh):
-        if not path.is_file():
-            raise InputError(
-                f"{path}: there is no such file. Set FEMOREG_DATA to the folder of the real bone shapes, or measure on "
-                "procedural patients only (--kind procedural)."
-            )
+    mesh = stores.data / "meshes" / f"{subject}.npz"
+    if not mesh.is_file():
+        raise InputError(
+            f"{mesh}: there is no such file. Set FEMOREG_DATA to the folder of the real bone shapes, or measure on "
+            "procedural patients only (--kind procedural)."
+        )
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent) as part:
-        built = Path(part) / "patient"
-        command = [sys.executable, str(tool), "--subject", subject, "--out", str(built), "--spacing", str(spacing_mm)]
-        done = subprocess.run(command, capture_output=True, encoding="utf-8")
-        if done.returncode:
-            last = (done.stderr.strip() or "no word").splitlines()[-1]
-            raise InputError(f"{tool}: failed for {subject} ({last}). It needs the extra `study`.")
-        built.replace(folder)
+    write_patient_around(mesh, folder, Options(spacing_mm=spacing_mm))
     return folder

@@ -5,12 +5,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from femoreg_torch.detect import Detection, detect
+from femoreg_torch.anatomy import HIP
+from femoreg_torch.detect import Detection, LandmarkNetwork, detect
 from femoreg_torch.geometry import Camera, project_points, transform_points
 from femoreg_torch.registration.start import Detector
-from femoreg_torch.volume import HIP_LANDMARKS
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,12 @@ def draw_landmarks(
     noise: DetectionNoise,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Pixels (14, 2) (column, row) and visibility (14,) of the landmarks, in the order of `HIP_LANDMARKS`.
+    """Pixels (L, 2) (column, row) and visibility (L,) of the landmarks, in the order of the anatomy's.
 
     Errors are normal along rows and columns alike, with the deviation whose mean distance, σ · √(π / 2), is the one
     asked for. Landmarks that lie outside the image (or that are unknown) are not visible.
     """
-    count = len(HIP_LANDMARKS)
+    count = len(HIP.landmarks)
     shift_mm = noise.mean_error_mm / math.sqrt(math.pi / 2) * torch.randn(count, 2, generator=generator).double()
     missed = torch.rand(count, generator=generator) < noise.missing
     gross = torch.rand(count, generator=generator) < noise.gross
@@ -42,7 +42,7 @@ def draw_landmarks(
     anywhere = torch.rand(count, 2, generator=generator).double() * size - 0.5
 
     unknown = torch.full((3,), torch.nan, dtype=torch.float64)
-    points = torch.stack([landmarks.get(name, unknown) for name in HIP_LANDMARKS])
+    points = torch.stack([landmarks.get(name, unknown) for name in HIP.landmark_names])
     exact = project_points(camera, transform_points(camera_from_pelvis, points))
     in_image = ((exact >= -0.5) & (exact <= size - 0.5)).all(1)
     pixel_mm = torch.tensor(camera.pixel_mm[::-1], dtype=torch.float64)
@@ -51,7 +51,11 @@ def draw_landmarks(
 
 
 def simulated_detector(
-    landmarks: Mapping[str, Tensor], camera_from_pelvis: Tensor, noise: DetectionNoise, seed: int, network: nn.Module
+    landmarks: Mapping[str, Tensor],
+    camera_from_pelvis: Tensor,
+    noise: DetectionNoise,
+    seed: int,
+    network: LandmarkNetwork,
 ) -> Detector:
     """A detector whose landmarks are drawn from the truth, all of them equally confident.
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
+from scipy.stats import binomtest
 
 from femoreg_torch.files import temporary_file
 from sim.study.quantities import QUANTITIES
@@ -61,7 +62,7 @@ def capture_figure(
     for axis, (name, points) in zip(axes, sweeps.items(), strict=True):
         offsets = [offset for offset, _, _ in points]
         rates = np.array([good / starts for _, good, starts in points])
-        bounds = np.array([wilson(good, starts) for _, good, starts in points])
+        bounds = np.array([rate_interval(good, starts) for _, good, starts in points])
         axis.fill_between(offsets, 100 * bounds[:, 0], 100 * bounds[:, 1], color="#3b6ea5", alpha=0.2, linewidth=0)
         axis.plot(offsets, 100 * rates, "o-", color="#3b6ea5")
         axis.set_xlabel(labels[name])
@@ -72,10 +73,7 @@ def capture_figure(
     return figure
 
 
-def wilson(successes: int, trials: int) -> tuple[float, float]:
+def rate_interval(successes: int, trials: int) -> tuple[float, float]:
     """95 % interval of a rate (Wilson, J Am Stat Assoc 22 (1927) 209)."""
-    z = 1.959964
-    rate, shrink = successes / trials, 1 + z * z / trials
-    middle = (rate + z * z / (2 * trials)) / shrink
-    half = z / shrink * np.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
-    return float(max(0.0, middle - half)), float(min(1.0, middle + half))
+    found = binomtest(successes, trials).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)

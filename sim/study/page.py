@@ -1,4 +1,4 @@
-"""`docs/accuracy.md`: sections of Markdown, each replaced as a whole when it is measured anew."""
+"""The page `docs/accuracy.md`: sections of Markdown, each replaced as a whole when it is measured anew."""
 
 import os
 import platform

@@ -1,10 +1,12 @@
 """Which procedures a study consists of."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from femoreg_torch.configs import load_preset
 
 from femoreg_torch.case.model import Side
+from femoreg_torch.settings import read_record
 from sim.study.detections import DetectionNoise
 
 
@@ -41,10 +43,9 @@ class Procedure:
         return f"{self.number:02d}_{self.patient}_{self.side}"
 
 
-def load_study(name: str) -> Study:
-    """Settings `configs/study/<name>.yaml`."""
-    content = load_preset("study", name)
-    return Study(**(content | {"detections": DetectionNoise(**content["detections"])}))
+def load_study(name: str | Path) -> Study:
+    """Settings of a preset in `configs/study/` or of a YAML file. Raises `InputError` that names the key."""
+    return read_record(Study, load_preset("study", name), f"study {name}")
 
 
 def procedures(study: Study) -> list[Procedure]:

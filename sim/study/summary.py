@@ -1,4 +1,4 @@
-"""Records of a study summed up: means over all runs, and whether those that are wrong said so."""
+"""Statistics of a study's records: errors over all runs, and whether wrong runs are flagged."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -113,8 +113,7 @@ def rows_of_csv(records: Sequence[Record]) -> list[dict[str, Any]]:
         row = {
             key: record[key] for key in ("number", "kind", "patient", "side", "seed", "preset", "trusted", "refused")
         }
-        reasons = [f"{name}: {q['reason']}" for name, q in record.get("quality", {}).items() if not q["trusted"]]
-        row["reason"] = "; ".join(reasons)
+        row["reason"] = "; ".join(record["reasons"])
         for prefix, errors in (("", record.get("errors", {})), ("start_", record.get("start_errors", {}))):
             for key, value in errors.items():
                 if not isinstance(value, dict):

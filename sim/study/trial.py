@@ -6,13 +6,16 @@ from typing import Any
 
 import torch
 
-from femoreg_torch.case import Case, Truth, read_case
+from femoreg_torch.case import Case, Result, read_case
+from femoreg_torch.case.femoroplasty import PELVIS
 from femoreg_torch.detect import load_network
 from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation import errors, poses_of, reference_points
+from femoreg_torch.evaluation import errors, reference_points
 from femoreg_torch.files import plain
+from femoreg_torch.geometry import Poses
 from femoreg_torch.registration import Plan
-from femoreg_torch.registration.run import register_by_plan
+from femoreg_torch.registration.run import register_scene
+from femoreg_torch.registration.scene import Scene
 from sim.study.detections import simulated_detector
 from sim.study.procedures import Procedure, Study
 from sim.study.summary import OBJECTS
@@ -27,19 +30,19 @@ def run_trial(folder: Path, procedure: Procedure, study: Study, plan: Plan, view
     case = read_case(folder)
     if case.truth is None:
         raise InputError(f"{folder}: has no truth, so there is nothing to measure errors against.")
+    truth = case.truth
     if views is not None:
-        poses = case.truth.camera_from_pelvis[:views]
-        case = replace(case, views=case.views[:views], truth=replace(case.truth, camera_from_pelvis=poses))
-    assert case.truth is not None  # seen above
+        truth = truth.first_views(views)
+        case = replace(case, views=case.views[:views], truth=truth)
     find = simulated_detector(
-        case.landmarks, case.truth.camera_from_pelvis[0], study.detections, procedure.seed, load_network()
+        case.landmarks, truth.camera1_from[PELVIS], study.detections, procedure.seed, load_network()
     )
     record: dict[str, Any] = {**asdict(procedure), "kind": kind(procedure), "preset": plan.preset}
     try:
-        result = register_by_plan(case, plan, procedure.number, find, lambda *_: None)
+        result, scene = register_scene(case, None, plan, seed=procedure.number, find=find)
     except InputError as error:
-        return record | {"refused": str(error), "trusted": False}
-    return plain(record | {"refused": None} | _measured(case, case.truth, result))
+        return record | {"refused": str(error), "trusted": False, "reasons": []}
+    return plain(record | {"refused": None} | _measured(case, scene, truth, result))
 
 
 def kind(procedure: Procedure) -> str:
@@ -47,21 +50,24 @@ def kind(procedure: Procedure) -> str:
     return "procedural" if procedure.procedural else "real"
 
 
-def _measured(case: Case, truth: Truth, result: dict[str, Any]) -> dict[str, Any]:
-    points = reference_points(case)
-    start = result["start"]["camera1_from_pelvis"]
-    device = None if case.device is None else case.device.camera1_from_device
-    at_start = Truth(start.expand_as(truth.camera_from_pelvis), start, device)
+def _measured(case: Case, scene: Scene, truth: Poses, result: Result) -> dict[str, Any]:
+    points = reference_points(case, scene)
+    assert result.start is not None  # of a registration that has just run
+    at_start = scene.start(result.start.camera1_from_object)
+    poses = {"camera_from_pelvis": result.poses.camera_from(PELVIS)}
+    poses |= {f"camera1_from_{name}": pose for name, pose in result.poses.camera1_from.items() if name != PELVIS}
     return {
-        "errors": errors(truth, poses_of(result), points),
+        "errors": errors(truth, result.poses, points),
         "start_errors": {name: row for name, row in errors(truth, at_start, points).items() if name in OBJECTS},
-        "landmarks_used": sum(mark["used"] for mark in result["start"]["landmarks"].values()),
-        "trusted": result["trusted"],
-        "quality": result["quality"],
-        "poses": {key: result.get(key) for key in ("camera_from_pelvis", "camera1_from_femur", "camera1_from_device")},
+        "landmarks_used": sum(mark.used for mark in result.start.landmarks.values()),
+        "trusted": result.verdict.trusted,
+        "reasons": list(result.verdict.reasons),
+        "skipped": list(result.skipped),
+        "quality": {name: asdict(value) for name, value in result.quality.items()},
+        "poses": poses,
         "stages": [
-            {key: stage[key] for key in ("name", "view", "evaluations", "seconds")} for stage in result["stages"]
+            {key: getattr(stage, key) for key in ("name", "view", "evaluations", "seconds")} for stage in result.stages
         ],
-        "timings_s": result["timings_s"],
+        "timings_s": result.timings_s,
         "threads": torch.get_num_threads(),
     }

@@ -1,4 +1,4 @@
-"""Does a wrong registration say so? Whole runs from starts that are meant to go wrong.
+"""Is a wrong registration flagged? Whole runs from starts that are meant to go wrong.
 
 From landmarks every procedure of the accuracy study succeeds, so it cannot tell. Here the pelvis starts near the end of
 the capture range or beyond it, or the device beyond what its search covers.
@@ -11,11 +11,14 @@ from typing import Any
 
 import torch
 
-from femoreg_torch.case import Truth, read_case
+from femoreg_torch.case import read_case
+from femoreg_torch.case.femoroplasty import DEVICE, PELVIS
+from femoreg_torch.case.model import Start
+from femoreg_torch.case.verdict import verdict_on
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import errors, reference_points
 from femoreg_torch.files import plain, write_json
-from femoreg_torch.registration import Plan, Poses, prepare_scene, run_plan
+from femoreg_torch.registration import Plan, prepare_scene, run_plan
 from femoreg_torch.registration.quality import Limits, assess
 from sim.study.capture import Offset, displaced
 from sim.study.page import machine, table, write_section
@@ -46,17 +49,17 @@ def sabotaged_runs(cases: Sequence[Path], plan: Plan, starts: int) -> list[dict[
     records = []
     for number, folder in enumerate(cases):
         case = read_case(folder)
-        if case.truth is None or case.truth.camera1_from_device is None:
+        if case.truth is None or DEVICE not in case.truth.camera1_from:
             raise InputError(f"{folder}: has no truth of pelvis and device to start from.")
         scene, points = prepare_scene(case), reference_points(case)
         for kind, sabotage in enumerate(SABOTAGES):
             for start in range(number, starts, len(cases)):
                 generator = torch.Generator().manual_seed(1000 * kind + start)
                 centres = {name: thing.reference_point for name, thing in scene.objects.items()}
-                pelvis = displaced(case.truth.camera_from_pelvis[0], centres["pelvis"], sabotage.pelvis, generator)
-                true = case.truth.camera1_from_device
-                device = displaced(true, centres["device"], sabotage.device, generator)
-                objects = {**scene.objects, "device": replace(scene.objects["device"], camera1_from=device)}
+                true = case.truth.camera1_from
+                pelvis = displaced(true[PELVIS], centres[PELVIS], sabotage.pelvis, generator)
+                device = displaced(true[DEVICE], centres[DEVICE], sabotage.device, generator)
+                objects = {**scene.objects, DEVICE: replace(scene.objects[DEVICE], start=Start(camera1_from=device))}
                 wrong = replace(scene, objects=objects)
                 outcome = run_plan(wrong, plan, pelvis, start, lambda *_: None)
                 quality = assess(wrong, outcome.poses, Limits(), plan.imaging, outcome.trace)
@@ -65,17 +68,13 @@ def sabotaged_runs(cases: Sequence[Path], plan: Plan, starts: int) -> list[dict[
                     "case": folder.name,
                     "start": start,
                     "refused": None,
-                    "errors": errors(case.truth, _truth(outcome.poses), points),
+                    "errors": errors(case.truth, outcome.poses, points),
                     "quality": {name: asdict(value) for name, value in quality.items()},
-                    "trusted": all(value.trusted for value in quality.values()),
+                    "trusted": verdict_on(tuple(outcome.poses.camera1_from), quality).trusted,
                 }
                 records.append(plain(record))
                 print(f"{folder.name}: {sabotage.name}, start {start}", flush=True)
     return records
-
-
-def _truth(poses: Poses) -> Truth:
-    return Truth(poses.camera_from("pelvis"), poses.camera1_from["femur"], poses.camera1_from["device"])
 
 
 def write_trust(records: Sequence[dict[str, Any]], preset: str, out: Path, docs: Path | None) -> str:

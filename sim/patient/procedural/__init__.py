@@ -1,0 +1,1 @@
+"""Patients drawn from a seed: bones as swept shapes whose landmarks follow from their geometry."""

@@ -1,0 +1,64 @@
+"""A patient taken apart for imaging after one femur has turned: the bone moves rigidly, the soft tissue bends."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.geometry import Camera, about_point, rigid
+from femoreg_torch.volume import Volume
+from sim.physics.line_integrals import areal_tissue
+from sim.physics.tissue_densities import COARSE_MM, separate
+from sim.theatre.femur_motion import rotate_femur
+
+
+@dataclass(frozen=True)
+class PosedTissue:
+    """Densities in g/cm³ after one femur has turned."""
+
+    filled: Volume  # water, and κ times bone; coarse, and bent around the femur
+    bone: Volume  # all bone but the turned femur
+    femur: Volume  # the bone of the turned femur, where the CT has it
+    lps_from_femur: Tensor  # (4, 4): the turn, LPS mm
+
+
+def take_apart(
+    ct: Volume, labels: Volume, femur: tuple[int, ...], rotation: Tensor, head_centre: Tensor
+) -> PosedTissue:
+    """The patient of a CT in HU whose femur has turned about its head centre by `rotation`.
+
+    `labels` lies on the grid of `ct`, 0 where there is no bone; `femur` holds the ids of the femur that moves.
+    `rotation` (3, 3) acts in LPS; `head_centre` (3,) in LPS mm. Raises `InputError` if the label map holds no such
+    femur.
+    """
+    filled, bone, (moving,), coarse_labels = separate(ct, labels, [femur])
+    turn = about_point(rigid(rotation), head_centre)
+    moving = moving.with_data(moving.data * (1 - _occupied(moving, coarse_labels, femur, turn)))
+    return PosedTissue(rotate_femur(filled, coarse_labels, femur, rotation, head_centre), bone, moving, turn)
+
+
+def _occupied(moving: Volume, labels: Volume, femur: tuple[int, ...], turn: Tensor) -> Tensor:
+    """Share (Z, Y, X) of each voxel of the femur that, once turned, lies in another bone: it is left out."""
+    others = (labels.data > 0) & ~torch.isin(labels.data, torch.tensor(femur, dtype=labels.data.dtype))
+    affine = torch.linalg.inv(labels.lps_from_index) @ turn @ moving.lps_from_index
+    depth, height, width = moving.data.shape
+    last = torch.tensor([width, height, depth], dtype=torch.float64) - 1
+    counts = [max(2, round(n * s / COARSE_MM)) for n, s in zip((width, height, depth), moving.spacing_mm, strict=True)]
+    scale = torch.diag(last / (torch.tensor(counts, dtype=torch.float64) - 1))
+    matrix = (affine[:3, :3] @ scale).flip(0, 1).numpy()
+    coarse = ndimage.affine_transform(
+        others.numpy().astype(np.float32), matrix, affine[:3, 3].flip(0).numpy(), tuple(counts[::-1]), order=1
+    )
+    size = (depth, height, width)
+    return F.interpolate(torch.from_numpy(coarse)[None, None], size=size, mode="trilinear", align_corners=True)[0, 0]
+
+
+def areal_posed_tissue(
+    tissue: PosedTissue, camera_from_lps: Tensor, camera: Camera, step_mm: float
+) -> dict[str, Tensor]:
+    """Mass per area (H, W) in g/cm² of `water` and `bone` of a patient whose femur has turned."""
+    poses = torch.stack([camera_from_lps, camera_from_lps @ tissue.lps_from_femur])
+    return areal_tissue(tissue.filled, camera_from_lps, [tissue.bone, tissue.femur], poses, camera, step_mm)
