@@ -1,4 +1,4 @@
-"""A compact multi-task U-Net: which bone each pixel shows, and where the 14 landmarks of the hip are.
+"""A compact multi-task U-Net: which bone each pixel shows, and where the landmarks are.
 
 After Ronneberger et al., MICCAI 2015, and the two-headed network of Grupp et al., IJCARS 15, 2020, made small enough to
 train on a CPU: the image enters as 4 × 4 patches turned into channels and the heads double the resolution again
@@ -9,32 +9,28 @@ pixels, like the dustbin of SuperPoint (DeTone et al., CVPRW 2018).
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from models.protocols import Prediction
+
 
 @dataclass(frozen=True)
-class UNetConfig:
+class UNetSettings:
     """Everything that fixes the network's shape."""
 
-    architecture: Literal["compact", "grupp2020"] = "compact"  # this module's, or `models.reference`
+    classes: int  # of the segmentation, the background included
+    landmarks: int
     channels: tuple[int, ...] = (64, 96, 160, 256)  # per level, at 1/4, 1/8, 1/16, 1/32 of the input
     convolutions: tuple[int, ...] = (2, 2, 3, 3)  # per level of the encoder
     residual: tuple[int, ...] = ()  # residual blocks after those, per level; none by default
     patch: int = 4  # pixels per side that become channels
-    classes: int = 7  # background, hip bones left and right, vertebrae, sacrum, femora left and right
-    landmarks: int = 14
 
-
-class Prediction(NamedTuple):
-    """Logits on a grid of half the input's resolution; its pixel i covers the input's pixels 2 i and 2 i + 1."""
-
-    segmentation: Tensor  # (B, classes, H / 2, W / 2)
-    heatmaps: Tensor  # (B, landmarks, H / 2, W / 2)
-    absence: Tensor  # (B, landmarks): competes with the pixels of the heat map in one softmax
+    def build(self) -> "UNet":
+        """A new network with random weights."""
+        return UNet(self)
 
 
 def _convolution(inputs: int, outputs: int) -> nn.Sequential:
@@ -44,9 +40,10 @@ def _convolution(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class _Residual(nn.Module):
-    """Two convolutions beside a shortcut, as in He et al., ECCV 2016.
+    """Two convolutions beside an identity shortcut, as in He et al., ECCV 2016.
 
-    The last scale starts at zero, so that a network may be deepened without changing what it has learned.
+    The last batch normalisation starts with scale zero, so that the block starts as the identity: a trained network can
+    be deepened without changing its function.
     """
 
     def __init__(self, width: int) -> None:
@@ -68,28 +65,28 @@ def _level(inputs: int, outputs: int, convolutions: int, residual: int) -> nn.Se
 
 
 class UNet(nn.Module):
-    """Takes images (B, 1, H, W) of mean 0 and deviation 1 each; H and W are multiples of patch · 2^(levels − 1)."""
+    """Maps images (B, 1, H, W), H and W multiples of patch · 2^(levels − 1), to a `Prediction`."""
 
-    def __init__(self, config: UNetConfig) -> None:
+    def __init__(self, settings: UNetSettings) -> None:
         super().__init__()
-        self.config = config
-        widths = config.channels
-        inputs = (config.patch**2, *widths[:-1])
-        blocks = config.residual or (0,) * len(widths)
-        sizes = zip(inputs, widths, config.convolutions, blocks, strict=True)
+        self.patch = settings.patch
+        widths = settings.channels
+        inputs = (settings.patch**2, *widths[:-1])
+        blocks = settings.residual or (0,) * len(widths)
+        sizes = zip(inputs, widths, settings.convolutions, blocks, strict=True)
         self.encoder = nn.ModuleList(_level(*size) for size in sizes)
         self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1, bias=False) for a, b in pairwise(widths))
         self.decoder = nn.ModuleList(_convolution(2 * a, a) for a in widths[:-1])
-        zoom = (config.patch // 2) ** 2
-        self.segmentation = nn.Conv2d(widths[0], config.classes * zoom, 1)
-        self.hidden = nn.Conv2d(widths[0] + config.classes * zoom, widths[0], 1)
-        self.heatmaps = nn.Conv2d(widths[0], config.landmarks * zoom, 1)
-        self.absence = nn.Linear(widths[-1], config.landmarks)
-        # Starts as likely as all pixels of a 96 × 96 heat map together.
+        zoom = (settings.patch // 2) ** 2
+        self.segmentation = nn.Conv2d(widths[0], settings.classes * zoom, 1)
+        self.hidden = nn.Conv2d(widths[0] + settings.classes * zoom, widths[0], 1)
+        self.heatmaps = nn.Conv2d(widths[0], settings.landmarks * zoom, 1)
+        self.absence = nn.Linear(widths[-1], settings.landmarks)
+        # at the start, absence is as probable as all pixels of a 96 × 96 heat map together
         nn.init.constant_(self.absence.bias, 2 * math.log(96))
 
     def forward(self, image: Tensor) -> Prediction:
-        features = F.pixel_unshuffle(image, self.config.patch).contiguous(memory_format=torch.channels_last)
+        features = F.pixel_unshuffle(image, self.patch).contiguous(memory_format=torch.channels_last)
         skips = []
         for depth, level in enumerate(self.encoder):
             features = level(F.max_pool2d(features, 2) if depth else features)
@@ -100,5 +97,5 @@ class UNet(nn.Module):
             features = decode(torch.cat([wide, skips.pop()], 1))
         segmentation = self.segmentation(features)
         hidden = F.relu(self.hidden(torch.cat([features, segmentation], 1)))
-        zoom = self.config.patch // 2
+        zoom = self.patch // 2
         return Prediction(F.pixel_shuffle(segmentation, zoom), F.pixel_shuffle(self.heatmaps(hidden), zoom), absence)

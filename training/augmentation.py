@@ -1,7 +1,8 @@
-"""Fluoroscopy out of stored layers: appearance and geometry are drawn anew for every image.
+"""Training images out of stored layers: appearance and geometry are drawn anew for every image.
 
-All functions work on batches and take the torch generator they draw from. The physics is a sketch made for variety:
-Beer-Lambert, scatter as a blurred share of the primary beam, Poisson noise, detector blur and saturation.
+All functions work on batches and take the torch generator they draw from. The physics is coarse, made for variety:
+Beer-Lambert attenuation, scatter as a blurred share of the primary beam, noise of the variance of Poisson's, detector
+blur and saturation.
 """
 
 import math
@@ -15,7 +16,10 @@ from kornia.geometry.transform import warp_affine
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from femoreg_torch.detect import MIRRORED_LABELS, MIRRORED_LANDMARKS, normalise
+from femoreg_torch.anatomy import HIP
+from femoreg_torch.detect import normalise
+
+_COARSE_KNOTS, _FINE_KNOTS = 4, 14  # along each axis of the image, of the fields `unevenness` and `gas`
 
 
 @dataclass(frozen=True)
@@ -49,12 +53,12 @@ class AugmentationSettings:
 
 
 class Batch(NamedTuple):
-    """What the network is trained on: images on its grid, truth on the grid of its output (half as fine)."""
+    """What a network is trained on: images on its grid, truth on the grid of its output (half as fine)."""
 
     images: Tensor  # (B, 1, 192, 192), normalised
     labels: Tensor  # (B, 96, 96) uint8
-    landmarks: Tensor  # (B, 14, 2) column, row
-    visible: Tensor  # (B, 14) bool
+    landmarks: Tensor  # (B, L, 2) column, row
+    visible: Tensor  # (B, L) bool
 
 
 def _uniform(low: float, high: float, shape: tuple[int, ...], generator: Generator) -> Tensor:
@@ -70,14 +74,14 @@ def _chosen(share: float, count: int, generator: Generator) -> Tensor:
 
 
 def compose(tissue: Tensor, bones: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:
-    """Attenuation (B, H, W) of weighted layers: `tissue` (B, H / 2, W / 2), `bones` (B, 6, H, W)."""
-    count = len(tissue)
+    """Attenuation (B, H, W) of weighted layers: `tissue` (B, H / 2, W / 2), `bones` (B, bones, H, W)."""
+    count, number = bones.shape[:2]
     soft = F.interpolate(tissue.float()[:, None], scale_factor=2, mode="bilinear")[:, 0]
-    spread = _uniform(1 - settings.bone_spread, 1 + settings.bone_spread, (count, 6, 1, 1), generator)
-    weights = (_uniform(*settings.bone, (count, 1, 1, 1), generator) * spread).view(count, 1, 6)
+    spread = _uniform(1 - settings.bone_spread, 1 + settings.bone_spread, (count, number, 1, 1), generator)
+    weights = (_uniform(*settings.bone, (count, 1, 1, 1), generator) * spread).view(count, 1, number)
     bone = (weights @ bones.float().flatten(2)).view(soft.shape)
-    unevenness = _smooth_field(count, 4, soft.shape[1:], generator) * settings.unevenness
-    unevenness += _smooth_field(count, 14, soft.shape[1:], generator) * settings.gas
+    unevenness = _smooth_field(count, _COARSE_KNOTS, soft.shape[1:], generator) * settings.unevenness
+    unevenness += _smooth_field(count, _FINE_KNOTS, soft.shape[1:], generator) * settings.gas
     return soft * _uniform(*settings.tissue, (count, 1, 1), generator) + bone + unevenness
 
 
@@ -100,9 +104,10 @@ def flip_sides(images: Tensor, labels: Tensor, landmarks: Tensor) -> tuple[Tenso
 
     `landmarks` are in pixels of the images.
     """
-    swapped = landmarks[..., MIRRORED_LANDMARKS, :].clone()
+    swapped = landmarks[..., list(HIP.mirrored_landmarks), :].clone()
     swapped[..., 0] = images.shape[-1] - 1 - swapped[..., 0]
-    return images.flip(-1), MIRRORED_LABELS.to(torch.uint8)[labels.flip(-1).long()], swapped
+    mirrored_class = torch.tensor(HIP.mirrored_classes, dtype=torch.uint8)
+    return images.flip(-1), mirrored_class[labels.flip(-1).long()], swapped
 
 
 def inside(landmarks: Tensor, shape: tuple[int, int]) -> Tensor:
@@ -265,7 +270,10 @@ def make_batch(
     generator: Generator,
     devices: Tensor | None = None,
 ) -> Batch:
-    """Training images from stored layers (shapes as in `sim.dataset`, with N = B views) and shadows of `devices`."""
+    """Training images from stored layers and shadows of `devices`.
+
+    Shapes of the layers are those of `sim.labelled.training_views`, with N = B views.
+    """
     images = compose(tissue, bones, settings, generator)
     count, shape = len(images), (images.shape[1], images.shape[2])
     flipped = flip_sides(images, labels, landmarks)

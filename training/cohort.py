@@ -15,11 +15,11 @@ from femoreg_torch.detect import network_camera
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import load_carm
 from femoreg_torch.volume import read_ct, read_labels, read_landmarks
-from sim.dataset import write_views
-from sim.layers import Layers, deform, smooth_displacement, split_layers
-from sim.mask_landmarks import landmarks_by_rule
+from sim.labelled.attenuation_layers import Layers, deform, smooth_displacement, split_layers
+from sim.labelled.layer_landmarks import landmarks_by_rule
+from sim.labelled.training_views import write_views
+from sim.labelled.view_poses import ViewRanges
 from sim.patient import make_patient
-from sim.views import ViewRanges
 from training.devices import render_devices
 
 _RENDERED = ("views", "deformation_mm", "carm", "seed", "ranges", "landmarks")  # settings that change what is rendered

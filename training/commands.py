@@ -5,7 +5,7 @@ from typing import Literal
 
 
 def train(
-    settings: Path,
+    settings: str,
     *,
     out: Path,
     cases: list[Path] | None = None,
@@ -24,7 +24,7 @@ def train(
     validation loss.
 
     Args:
-        settings: YAML file such as configs/training/hip14.yaml.
+        settings: preset in configs/training (hip14, quick, grupp2020), or a YAML file, which may extend one.
         out: folder of this run.
         cases: folders with ct.nii.gz, labels.nii.gz and landmarks.json to learn from, beside the procedural patients.
         cache: folder of rendered views, to share between runs; by default OUT/cache.
@@ -44,33 +44,48 @@ def train(
     )
 
 
-def measure(images: list[Path], *, out: Path, weights: Path | None = None, register: list[Path] | None = None) -> None:
+def measure(
+    images: list[Path],
+    *,
+    out: Path,
+    weights: Path | None = None,
+    register: list[Path] | None = None,
+    altered: bool = False,
+) -> None:
     """Measure the landmark network and its start poses on labelled images.
 
-    Writes into OUT: accuracy.json and accuracy.md, with intervals by bootstrap over patients.
+    Writes into OUT: accuracy.json and accuracy.md, with intervals by bootstrap over patients, and reliability.png, the
+    share of right landmarks over their confidence.
 
     Args:
-        images: files of labelled images (safetensors), one per patient.
+        images: files of labelled images (safetensors), one per patient, that `femoreg labelled-images` made.
         out: folder of the results.
         weights: network weights (safetensors); by default the shipped ones.
-        register: one folder per file with the patient's ct.nii.gz, labels.nii.gz and landmarks.json; every image with a
-            start pose is then registered by the first stages of the preset `fast` (seconds per image).
+        register: one folder per file, in the same order, with the ct.nii.gz, labels.nii.gz and landmarks.json that the
+            file was made from; every image with a start pose is then registered by the first stages of the preset
+            `fast` (seconds per image).
+        altered: also count the start poses in the same images turned by 180°, with inverted grey values, and cropped
+            to one hip (takes four times as long).
     """
     from rich.console import Console
 
     from femoreg_torch.detect import load_network
     from femoreg_torch.errors import InputError
-    from training.accuracy_table import accuracy_page, write_accuracy
-    from training.measure import images_of_file, read_images, summarise
+    from training.accuracy_page import write_accuracy
+    from training.labelled import images_of_file
+    from training.measure import Reading, read_images
+    from training.robustness import ALTERATIONS, outcomes
     from training.single_view import single_view_registration
 
     if register and len(register) != len(images):
         raise InputError(f"--register: {len(register)} folders for {len(images)} files of images; one each is needed.")
     network = load_network(weights)
-    readings = []
+    readings: list[Reading] = []
     for number, path in enumerate(images):
         registration = single_view_registration(register[number], "fast") if register else None
         readings += read_images(network, images_of_file(path), register=registration)
-    accuracy = summarise(readings)
-    write_accuracy(out, accuracy)
-    Console().print(accuracy_page(accuracy), highlight=False)
+    counted = {"as they are": outcomes(readings)} if altered else {}
+    for name, alter in (ALTERATIONS if altered else {}).items():
+        changed = (alter(image) for path in images for image in images_of_file(path))
+        counted[name] = outcomes(read_images(network, changed))
+    Console().print(write_accuracy(out, readings, counted), highlight=False)

@@ -18,9 +18,10 @@ def draw_curves(events: Path, picture: Path) -> None:
     log.Reload()
     figure = Figure(figsize=(9, 3), layout="constrained")
     losses, accuracy = figure.subplots(1, 2)
-    for name, colour in {"landmarks": "tab:blue", "segmentation": "tab:orange"}.items():
-        _plot(losses, log, f"train/{name}", f"{name}, training", colour, 0.4)
-        _plot(losses, log, f"validation/{name}", f"{name}, validation", colour, 1.0)
+    logged = (tag.removeprefix("train/") for tag in log.Tags()["scalars"] if tag.startswith("train/"))
+    for n, name in enumerate(sorted(logged)):
+        _plot(losses, log, f"train/{name}", f"{name}, training", f"C{n}", 0.4)
+        _plot(losses, log, f"validation/{name}", f"{name}, validation", f"C{n}", 1.0)
     _plot(accuracy, log, "validation/landmark_within_2px", "landmarks within 6.2 mm", "tab:blue", 1.0)
     _plot(accuracy, log, "validation/visibility", "visibility right", "tab:green", 1.0)
     _plot(accuracy, log, "validation/pixel_accuracy", "labels right", "tab:orange", 1.0)

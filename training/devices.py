@@ -12,11 +12,12 @@ from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera
-from sim.device import make_device
-from sim.imaging import device_density
-from sim.labelled_views import DeviceRanges, device_pose
+from sim.labelled.devices_in_view import device_pose
+from sim.labelled.settings import DeviceRanges
+from sim.physics.line_integrals import device_density
+from sim.theatre.device import make_device
 
-# Wider than where `sim.labelled_images` puts the devices that a network is measured with, and other devices.
+# Wider than where `sim.labelled.physics_views` puts the devices that a network is measured with, and other devices.
 _RANGES = DeviceRanges(share=1.0, count=24, hu=5000.0, depth_mm=(450.0, 700.0), shift_mm=90.0, angle_deg=35.0)
 _FIRST_SEED = 1000
 _STEP_MM = 1.0

@@ -1,4 +1,4 @@
-"""The Lightning module: the network, its losses, and how it learns."""
+"""The Lightning module: a network, its loss and its optimiser."""
 
 import math
 from dataclasses import dataclass
@@ -8,9 +8,7 @@ from lightning import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
-from models.build import make_network
-from models.losses import landmark_log_probabilities, multi_task_loss
-from models.unet import Prediction, UNetConfig
+from models.protocols import Loss, Network, Prediction
 from training.augmentation import Batch
 
 
@@ -25,8 +23,6 @@ class OptimisationSettings:
     learning_rate: float = 2e-3
     weight_decay: float = 1e-3
     warm_up: float = 0.05  # share of all steps
-    sigma_px: float = 1.5  # of the heat-map target on the network's output grid (3.1 mm pixels)
-    landmark_weight: float = 0.5
     averaging: float = 0.998  # decay of the moving average of the weights that is validated and exported
     patience: int = 0  # epochs without a better validation loss before training stops early; 0: never
 
@@ -39,25 +35,18 @@ def landmark_errors_px(prediction: Prediction, landmarks: Tensor, visible: Tenso
     return (found - landmarks).norm(dim=-1)[visible]
 
 
-class HipTraining(LightningModule):
-    """Trains a network on `Batch`es; logs losses, landmark errors, visibility and overlap."""
+class NetworkTraining(LightningModule):
+    """Trains a network on `Batch`es; logs the loss and its parts, landmark errors, visibility and overlap."""
 
-    def __init__(self, network: UNetConfig, settings: OptimisationSettings) -> None:
+    def __init__(self, network: Network, loss: Loss, settings: OptimisationSettings) -> None:
         super().__init__()
-        self.network = make_network(network).to(memory_format=torch.channels_last)
+        self.network = network.build().to(memory_format=torch.channels_last)
+        self.loss = loss
         self.settings = settings
 
     def _losses(self, batch: Batch) -> tuple[Prediction, dict[str, Tensor]]:
         prediction = self.network(batch.images)
-        losses = multi_task_loss(
-            prediction,
-            batch.labels,
-            batch.landmarks,
-            batch.visible,
-            self.settings.sigma_px,
-            self.settings.landmark_weight,
-        )
-        return prediction, losses
+        return prediction, self.loss(prediction, batch.labels, batch.landmarks, batch.visible)
 
     def training_step(self, batch: Batch, _number: int) -> Tensor:
         _, losses = self._losses(batch)
@@ -66,8 +55,8 @@ class HipTraining(LightningModule):
 
     def validation_step(self, batch: Batch, _number: int) -> dict[str, Tensor]:
         prediction, losses = self._losses(batch)
-        absent = landmark_log_probabilities(prediction.heatmaps, prediction.absence)[..., -1].exp()
-        correct = ((absent < 0.5) == batch.visible).float().mean()
+        seen = prediction.heatmaps.float().flatten(2).logsumexp(-1) > prediction.absence.float()
+        correct = (seen == batch.visible).float().mean()
         overlap = (prediction.segmentation.argmax(1) == batch.labels).float().mean()
         values = {f"validation/{name}": value for name, value in losses.items()}
         errors = landmark_errors_px(prediction, batch.landmarks, batch.visible)

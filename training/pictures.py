@@ -1,4 +1,4 @@
-"""What the network sees, as pictures in TensorBoard."""
+"""What a network sees during training, as pictures in TensorBoard."""
 
 import numpy as np
 from lightning import LightningModule, Trainer
@@ -7,16 +7,15 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from numpy.typing import NDArray
 from torch import Tensor
 
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import decode_heatmaps
 from femoreg_torch.detect.network import VISIBLE
-from models.unet import Prediction
+from femoreg_torch.detect.overlay import class_colours
+from models.protocols import Prediction
 from training.augmentation import Batch
 
 _SHOWN = 4
 _CONTRAST = 2.5  # standard deviations of grey on either side of the mean
-_COLOURS = np.array(  # RGB of background, hip bones, vertebrae, sacrum, femora
-    [[0, 0, 0], [255, 120, 60], [60, 160, 255], [230, 220, 60], [180, 90, 220], [255, 60, 100], [60, 220, 160]]
-)
 
 
 class Pictures(Callback):
@@ -34,7 +33,7 @@ class Pictures(Callback):
 
 
 def draw_batch(batch: Batch, prediction: Prediction, count: int) -> NDArray[np.uint8]:
-    """RGB picture of `count` images side by side; what is true above, what the network says below."""
+    """RGB picture of `count` images side by side; truth above, prediction below."""
     columns = []
     for n in range(min(count, len(batch.images))):
         heatmaps, absence = prediction.heatmaps[n].float().cpu(), prediction.absence[n].float().cpu()
@@ -50,7 +49,7 @@ def _draw(image: Tensor, labels: Tensor, landmarks: Tensor) -> NDArray[np.float6
     """Image (H, W) with bones (H / 2, W / 2) tinted and landmarks (N, 2), in pixels of the labels, as 3 × 3 dots."""
     grey = (image / _CONTRAST + 1).clamp(0, 2).numpy()[..., None] * 127.5
     fine = labels.repeat_interleave(2, 0).repeat_interleave(2, 1).numpy()
-    picture = 0.75 * grey + 0.25 * _COLOURS[fine]
+    picture = 0.75 * grey + 0.25 * class_colours(HIP)[fine]
     for column, row in (2 * landmarks + 0.5).round().int().tolist():
         picture[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2] = (255, 255, 255)
     return np.asarray(picture)

@@ -1,17 +1,19 @@
-"""What becomes of the start pose when an image is not as it should be: a good start, a refusal, or a silent failure."""
+"""What becomes of the start pose in an altered image: a good start, a refusal, or a silent failure."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
-from training.measure import COARSE, LabelledImage, Reading
+from training.accuracy import COARSE
+from training.labelled import LabelledImage
+from training.measure import Reading
 
 _NARROW = 0.55  # share of the image's width that a crop to one hip leaves
 
 
 def turned(image: LabelledImage) -> LabelledImage:
-    """The image on its head; the patient's pose is turned about the central ray with it."""
+    """The image turned by 180°, and the patient's pose about the central ray with it."""
     rows, columns = image.camera.shape
     last = torch.tensor([columns - 1, rows - 1], dtype=image.landmarks.dtype)
     half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
@@ -23,7 +25,7 @@ def turned(image: LabelledImage) -> LabelledImage:
         landmarks=last - image.landmarks,
         labels=image.labels.rot90(2),
         camera=camera,
-        camera_from_lps=None if image.camera_from_lps is None else half_turn @ image.camera_from_lps,
+        camera_from_lps=half_turn @ image.camera_from_lps,
     )
 
 
@@ -48,19 +50,25 @@ def cropped_to_one_hip(image: LabelledImage) -> LabelledImage:
     return replace(image, attenuation=attenuation, labels=labels, visible=image.visible & ~hidden)
 
 
-VARIANTS: dict[str, Callable[[LabelledImage], LabelledImage]] = {
-    "as it is": lambda image: image,
+ALTERATIONS: dict[str, Callable[[LabelledImage], LabelledImage]] = {
     "turned by 180°": turned,
     "grey values inverted": inverted,
     "cropped to one hip": cropped_to_one_hip,
 }
 
 
-def outcomes(readings: Iterable[Reading]) -> dict[str, int]:
-    """Numbers of good starts (within 10°, 20 mm, 100 mm), refusals and silent failures among the poses asked for."""
-    counted = {"good": 0, "refused": 0, "silent failure": 0}
-    for reading in readings:
-        if reading.asked:
-            good = bool((reading.pose_error < COARSE).all())
-            counted["refused" if reading.refused else "good" if good else "silent failure"] += 1
-    return counted
+@dataclass(frozen=True)
+class Outcomes:
+    """What became of the start poses that were asked for."""
+
+    good: int
+    refused: int
+    silent_failures: int
+
+
+def outcomes(readings: Iterable[Reading]) -> Outcomes:
+    """Numbers of start poses within 10°, 20 mm and 100 mm, of refusals, and of other poses that were given."""
+    asked = [reading for reading in readings if reading.asked]
+    refused = sum(reading.refused for reading in asked)
+    good = sum(bool((reading.pose_error < COARSE).all()) for reading in asked)
+    return Outcomes(good, refused, len(asked) - refused - good)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -16,16 +16,18 @@ from lightning.pytorch.callbacks import (
 )
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from rich.console import Console
+from torch import nn
 
+from femoreg_torch.anatomy import HIP
+from femoreg_torch.detect import load_network
+from femoreg_torch.detect.grid import NETWORK_SIZE
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file, write_json
-from models.reference import ReferenceUNet
-from models.unet import UNet
-from models.weights import SHIPPED_WEIGHTS, load_weights, save_weights
+from models.weights import SHIPPED_WEIGHTS, Weights, save_weights
 from training.cohort import render_cohort
 from training.curves import draw_curves
 from training.data import ViewData
-from training.module import HipTraining
+from training.module import NetworkTraining
 from training.pictures import Pictures
 from training.settings import TrainingSettings
 
@@ -56,9 +58,8 @@ def train_network(
     """Render what is missing in `cache`, train, and return the path of the exported weights in `out`.
 
     The weights exported are the ones of lowest validation loss or, without patients to validate on, the last ones.
-    `start` names weights to begin with; a network that only has more residual blocks begins as the same function.
-    Raises `InputError` if `out` holds a run and `resume` is false, or has none to resume, or if `start` does not
-    fit.
+    `start` names weights to begin with, see `begin_with`. Raises `InputError` if `out` holds a run and `resume` is
+    false, or has none to resume, or if `start` does not fit.
     """
     console = Console()
     last = out / "checkpoints" / "last.ckpt"
@@ -66,24 +67,25 @@ def train_network(
         raise InputError(f"{last}: no such file, so there is nothing to resume. Leave out --resume.")
     if last.is_file() and not resume:
         raise InputError(f"{out}: holds a training run. Continue it with --resume, or choose another folder.")
-    torch.set_num_threads(settings.threads)
-    cohort = render_cohort(settings.cohort, cases, cache, console.print)
+    run = settings.run
+    torch.set_num_threads(run.threads)
+    cohort = render_cohort(run.cohort, cases, cache, console.print)
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "settings.json", {**asdict(settings), "cases": [case.resolve().name for case in cases]})
-    seed_everything(settings.seed)
-    optimisation = settings.optimisation
+    write_json(out / "settings.json", {**settings.as_content(), "cases": [case.resolve().name for case in cases]})
+    seed_everything(run.seed)
+    optimisation = run.optimisation
     data = ViewData(
         cohort,
-        settings.augmentation,
+        run.augmentation,
         optimisation.batch_size,
         optimisation.batches_per_epoch,
         optimisation.validation_batches,
-        settings.workers,
-        settings.seed,
+        run.workers,
+        run.seed,
     )
-    module = HipTraining(settings.network, optimisation)
+    module = NetworkTraining(settings.network, settings.loss, optimisation)
     if start is not None and not resume:
-        _begin_with(start, module.network)
+        begin_with(start, module.network)
     best = ModelCheckpoint(
         out / "checkpoints",
         "best",
@@ -99,7 +101,7 @@ def train_network(
         accelerator=machine.accelerator,
         devices=machine.devices,
         num_nodes=machine.nodes,
-        precision=settings.precision,
+        precision=run.precision,
         max_epochs=optimisation.epochs,
         reload_dataloaders_every_n_epochs=1,
         use_distributed_sampler=False,
@@ -116,28 +118,42 @@ def train_network(
     return export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
 
 
-def _begin_with(path: Path, network: UNet | ReferenceUNet) -> None:
-    """Copy the weights of a file; residual blocks that the file lacks stay the identity they begin as."""
+def begin_with(path: Path, network: nn.Module) -> None:
+    """Copy the weights of a file into a new network.
+
+    The network may have more than the file, as long as it then computes the same function: residual blocks that start
+    as the identity, say. Raises `InputError` if it does not.
+    """
+    start = load_network(path).module
+    mode = network.training
+    image = torch.randn((1, 1, NETWORK_SIZE, NETWORK_SIZE), generator=torch.Generator().manual_seed(0))
     try:
-        start = load_weights(path)
-    except (OSError, ValueError) as error:
-        raise InputError(str(error)) from error
-    if replace(start.config, residual=network.config.residual) != network.config:
-        raise InputError(f"{path}: these weights are of {start.config}, but the settings ask for {network.config}.")
-    network.load_state_dict({**network.state_dict(), **start.state_dict()})
+        network.load_state_dict({**network.state_dict(), **start.state_dict()})
+        with torch.inference_mode():
+            for found, expected in zip(network.eval()(image), start(image), strict=True):
+                torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
+    except (RuntimeError, AssertionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: the network of the settings is not that of these weights ({reason}).") from error
+    network.train(mode)
 
 
 def export_weights(checkpoint: Path, settings: TrainingSettings, path: Path) -> Path:
     """Write the averaged weights of a checkpoint as safetensors."""
     content = torch.load(checkpoint, weights_only=True)
-    module = HipTraining(settings.network, settings.optimisation)
+    module = NetworkTraining(settings.network, settings.loss, settings.run.optimisation)
     module.load_state_dict(content["state_dict"])
-    about = {"step": str(content["global_step"]), "seed": str(settings.seed), "data": json.dumps(_data(settings))}
+    known = settings.as_content()
+    network = {key: value for key, value in known["network"].items() if key != "kind"}
+    state = module.network.state_dict()
+    weights = Weights(settings.network_kind, network, HIP.name, settings.loss.sigma_px, state)
+    data = {key: value for key, value in known["cohort"].items() if key != "ranges"}  # what the weights have seen
+    about = {
+        "step": str(content["global_step"]),
+        "seed": str(settings.run.seed),
+        "data": json.dumps(data),
+        "loss": json.dumps(known["loss"]),
+    }
     with temporary_file(path) as part:
-        save_weights(part, module.network, about)
+        save_weights(part, weights, about)
     return path
-
-
-def _data(settings: TrainingSettings) -> dict[str, object]:
-    """What the weights have seen, for the metadata."""
-    return {key: value for key, value in asdict(settings.cohort).items() if key != "ranges"}

@@ -1,36 +1,42 @@
-"""The network and its weights on disk."""
+"""The compact network: shapes, alignment of output and input, and growth."""
 
-import json
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 import torch
-from safetensors.torch import save_file
 from torch.testing import assert_close
 
-from models.unet import UNet, UNetConfig
-from models.weights import SHIPPED_WEIGHTS, load_weights, save_weights
+from models.unet import UNet, UNetSettings
 
-TINY = UNetConfig(channels=(8, 12, 16), convolutions=(1, 1, 1))
+TINY = UNetSettings(classes=5, landmarks=9, channels=(8, 12, 16), convolutions=(1, 1, 1))
 
 
 @pytest.fixture
 def network() -> UNet:
     torch.manual_seed(3)
-    return UNet(TINY).eval()
+    return TINY.build().eval()
 
 
 def test_outputs_have_half_the_resolution(network: UNet) -> None:
     prediction = network(torch.randn(2, 1, 64, 96))
-    assert prediction.segmentation.shape == (2, 7, 32, 48)
-    assert prediction.heatmaps.shape == (2, 14, 32, 48)
-    assert prediction.absence.shape == (2, 14)
+    assert prediction.segmentation.shape == (2, 5, 32, 48)
+    assert prediction.heatmaps.shape == (2, 9, 32, 48)
+    assert prediction.absence.shape == (2, 9)
+
+
+def test_residual_blocks_start_as_the_identity(network: UNet) -> None:
+    torch.manual_seed(4)
+    deeper = replace(TINY, residual=(1, 0, 2)).build().eval()
+    deeper.load_state_dict({**deeper.state_dict(), **network.state_dict()})
+    image = torch.randn(1, 1, 64, 64)
+    assert len(deeper.state_dict()) > len(network.state_dict())
+    assert_close(deeper(image).heatmaps, network(image).heatmaps)
 
 
 def test_the_output_lies_centred_on_the_input() -> None:
-    """Mirroring the weights and the image mirrors the output, so that no half-pixel shift hides in the network."""
+    """Mirroring weights and image mirrors the output: there is no shift by half a pixel in the network."""
     torch.manual_seed(1)
-    network = UNet(TINY).eval()
+    network = TINY.build().eval()
     image = torch.randn(1, 1, 64, 64)
     with torch.no_grad():
         straight = network(image).segmentation
@@ -46,32 +52,3 @@ def test_the_output_lies_centred_on_the_input() -> None:
             head.bias.copy_(head.bias.view(count, 2, 2).flip(2).flatten())
         mirrored = network(image.flip(-1)).segmentation
     assert_close(mirrored.flip(-1), straight, atol=1e-4, rtol=1e-4)
-
-
-def test_weights_round_trip(network: UNet, tmp_path: Path) -> None:
-    path = tmp_path / "tiny.safetensors"
-    save_weights(path, network, {"seed": "3"})
-    again = load_weights(path)
-    assert again.config == TINY
-    assert not again.training
-    image = torch.randn(1, 1, 64, 64)
-    assert_close(again(image).heatmaps, network(image).heatmaps, atol=0, rtol=0)
-
-
-def test_weights_that_do_not_fit(network: UNet, tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        load_weights(tmp_path / "missing.safetensors")
-    save_file({"a": torch.zeros(1)}, tmp_path / "other.safetensors")
-    with pytest.raises(ValueError, match="no `config`"):
-        load_weights(tmp_path / "other.safetensors")
-    save_file({"a": torch.zeros(1)}, tmp_path / "odd.safetensors", metadata={"config": json.dumps({"depth": 3})})
-    with pytest.raises(ValueError, match="do not fit"):
-        load_weights(tmp_path / "odd.safetensors")
-
-
-def test_the_shipped_weights() -> None:
-    network = load_weights()
-    assert network.config.landmarks == 14
-    assert network.config.classes == 7
-    shipped = Path(__file__).resolve().parents[2] / "models" / "weights" / SHIPPED_WEIGHTS
-    assert shipped.stat().st_size <= 20e6

@@ -1,40 +1,40 @@
-"""Reliability of confidences that were drawn to be right, and of others that boast."""
+"""Reliability of confidences that were drawn to be right, and of others that are too high."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from training.calibration import calibration_error, draw_reliability, negative_log_likelihood, reliability
+from femoreg_torch.anatomy import HIP
+from training.calibration import calibration_error, draw_reliability, reliability
+from training.measure import Reading
 
 
-def draws(exponent: float) -> tuple[np.ndarray, np.ndarray]:
-    """20 000 landmarks right with probability p, stated as p to the power of `exponent`."""
+def readings(exponent: float) -> list[Reading]:
+    """20 000 landmarks right with probability p, stated as p to the power of `exponent`.
+
+    Half of those that are wrong are not in the image, the others are 20 mm off.
+    """
     rng = np.random.default_rng(1)
     p = rng.uniform(0, 1, 20_000)
-    return p**exponent, rng.uniform(size=p.size) < p
+    right, absent = rng.uniform(size=p.size) < p, rng.uniform(size=p.size) < 0.5
+    error, visible = np.where(right | absent, 3.0, 20.0), right | ~absent
+    nothing = np.zeros((len(HIP.bones), 2))
+    return [Reading("one", error, p > 0.5, visible, p**exponent, nothing, False, False, np.full(3, np.nan))]
 
 
-def test_honest_confidences() -> None:
-    confidence, right = draws(1.0)
-    stated, true, number = reliability(confidence, right)
+def test_calibrated_confidences() -> None:
+    stated, true, number = reliability(readings(1.0))
     np.testing.assert_allclose(stated, true, atol=0.04)
     assert number.sum() == 20_000
-    assert calibration_error(confidence, right) < 0.015
+    assert calibration_error(readings(1.0)) < 0.015
 
 
-def test_boasting_is_seen() -> None:
+def test_confidences_that_are_too_high() -> None:
     """Stated √p where p is true: off by ∫ (√p − p) dp = 1/6 in the mean."""
-    confidence, right = draws(0.5)
-    assert calibration_error(confidence, right) == pytest.approx(1 / 6, abs=0.01)
-    assert negative_log_likelihood(confidence, right) > negative_log_likelihood(*draws(1.0)) + 0.05
-
-
-def test_likelihood_by_hand() -> None:
-    value = negative_log_likelihood(np.array([0.8, 0.4]), np.array([True, False]))
-    assert value == pytest.approx(-(np.log(0.8) + np.log(0.6)) / 2)
+    assert calibration_error(readings(0.5)) == pytest.approx(1 / 6, abs=0.01)
 
 
 def test_the_picture(tmp_path: Path) -> None:
-    draw_reliability({"honest": draws(1.0), "boasting": draws(0.5)}, tmp_path / "reliability.png")
+    draw_reliability(readings(1.0), tmp_path / "reliability.png")
     assert (tmp_path / "reliability.png").stat().st_size > 5000

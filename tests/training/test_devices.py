@@ -8,7 +8,7 @@ import torch
 from femoreg_torch.detect import network_camera
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import load_carm
-from sim.materials import metal_density
+from sim.physics.materials import metal_density
 from training.augmentation import AugmentationSettings, add_devices
 from training.devices import read_devices, render_devices
 

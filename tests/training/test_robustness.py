@@ -1,13 +1,17 @@
-"""Variants of an image: truth and image stay together."""
+"""Altered images: truth and image stay together; start poses are counted."""
 
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.geometry import load_carm, project_points, transform_points
-from training.measure import LabelledImage
-from training.robustness import cropped_to_one_hip, inverted, turned
+from training.labelled import LabelledImage
+from training.measure import Reading
+from training.robustness import Outcomes, cropped_to_one_hip, inverted, outcomes, turned
 
+(VERTEBRAE,) = HIP.classes(["vertebrae"])
 CAMERA = load_carm("cios_fusion").camera.downsampled(8)
 POINTS = torch.tensor(
     [[x, y, z] for x in (-90.0, -20, 10, 40, 60, 80, 100) for y, z in ((-20.0, -50), (30, 40))]
@@ -19,14 +23,15 @@ TRUTH = torch.tensor([[1.0, 0, 0, 5], [0, 0, -1, 9], [0, 1, 0, 760], [0, 0, 0, 1
 def image() -> LabelledImage:
     pixels = project_points(CAMERA, transform_points(TRUTH, POINTS))
     labels = torch.zeros(192, 192, dtype=torch.uint8)
-    labels[:, :60] = 3
+    labels[:, :60] = VERTEBRAE
     attenuation = torch.linspace(1, 4, 192).expand(192, 192)
-    return LabelledImage("one", attenuation, CAMERA, pixels, labels, torch.ones(14, dtype=torch.bool), POINTS, TRUTH)
+    return LabelledImage(
+        "one", attenuation, CAMERA, pixels, labels, torch.ones(len(POINTS), dtype=torch.bool), POINTS, TRUTH
+    )
 
 
 def test_a_turn_takes_the_pose_along(image: LabelledImage) -> None:
     other = turned(image)
-    assert other.camera_from_lps is not None
     assert_close(project_points(other.camera, transform_points(other.camera_from_lps, POINTS)), other.landmarks)
     assert other.attenuation[0, 0] == image.attenuation[-1, -1]
     assert other.labels[0, 0] == image.labels[-1, -1]
@@ -46,3 +51,21 @@ def test_a_crop_keeps_the_fuller_side_and_hides_the_rest(image: LabelledImage) -
     assert (other.attenuation[:, :80] == 4).all()
     assert other.attenuation[:, 100:].equal(image.attenuation[:, 100:])
     assert not other.labels[:, :60].any()
+
+
+def test_start_poses_are_good_refused_or_silent_failures() -> None:
+    def reading(asked: bool, refused: bool, error: tuple[float, float, float]) -> Reading:
+        none = np.zeros(0)
+        return Reading("one", none, none > 0, none > 0, none, none, asked, refused, np.array(error))
+
+    missing = (np.nan, np.nan, np.nan)
+    readings = [
+        reading(False, False, missing),
+        reading(True, True, missing),
+        reading(True, False, (9.0, 19.0, 99.0)),
+        reading(True, False, (1.0, 1.0, 1.0)),
+        reading(True, False, (11.0, 1.0, 1.0)),
+        reading(True, False, (1.0, 21.0, 1.0)),
+        reading(True, False, (1.0, 1.0, 101.0)),
+    ]
+    assert outcomes(readings) == Outcomes(good=2, refused=1, silent_failures=3)

@@ -1,23 +1,39 @@
-"""Single-view registration of labelled images: the preset's first stages, on images that are binned already."""
+"""Single-view registration of a labelled image: a start pose turned and shifted in the image plane comes back."""
 
-from dataclasses import replace
+from pathlib import Path
 
-import pytest
+import torch
 
-from femoreg_torch.errors import InputError
-from femoreg_torch.registration import load_plan
-from femoreg_torch.registration.plan import Stage
-from sim.study.capture import first_stages
-from training import single_view
+from femoreg_torch.drr import project
+from femoreg_torch.geometry import about_point, exp_so3, load_carm, rigid, rotation_angle, transform_points
+from femoreg_torch.volume import hu_to_attenuation, read_ct, resample_isotropic
+from training.labelled import LabelledImage
+from training.single_view import single_view_registration
+
+TRUTH = torch.tensor([[1.0, 0, 0, 5], [0, 0, -1, 4], [0, 1, 0, 760], [0, 0, 0, 1]]).double()
+REFINEMENT = """
+extends: fast
+steps:
+  - {name: "pelvis in view 1, coarse", remove: true}
+  - {name: "femur in view 1, coarse", remove: true}
+"""
 
 
-def test_levels_follow_the_binning() -> None:
-    plan = first_stages(load_plan("fast"))
-    binned = single_view._on_binned_images(plan, 4)
-    for before, after in zip(plan.steps, binned.steps, strict=True):
-        assert isinstance(before, Stage)
-        assert isinstance(after, Stage)
-        assert after.level.downsample * 4 == before.level.downsample
-        assert replace(after, level=before.level) == before
-    with pytest.raises(InputError, match="not a multiple of the images' binning, 5"):
-        single_view._on_binned_images(plan, 5)
+def test_the_pelvis_comes_back(case: Path, tmp_path: Path) -> None:
+    """The image is drawn from the CT itself, all that is bone in it, on pixels eight times as large as the C-arm's."""
+    camera = load_carm("cios_fusion").camera.downsampled(8)
+    ct = read_ct(case / "ct.nii.gz")
+    bone = ct.with_data(hu_to_attenuation(ct.data.float().where(ct.data > 300, torch.tensor(-1000.0)), -1000.0))
+    image = project([resample_isotropic(bone, 1.0)], TRUTH[None, None], camera, 1.0)[0]
+    none = torch.zeros(0)
+    labelled = LabelledImage("boxes", image, camera, none, none, none > 0, none, TRUTH)
+    middle = TRUTH[:3, 3]
+    turn = rigid(exp_so3(torch.deg2rad(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))))
+    shift = rigid(translation=torch.tensor([3.0, -4.0, 0.0], dtype=torch.float64))
+    preset = tmp_path / "refinement.yaml"
+    preset.write_text(REFINEMENT)
+    found = single_view_registration(case, str(preset))(labelled, shift @ about_point(turn, middle) @ TRUTH)
+    assert torch.rad2deg(rotation_angle(TRUTH[:3, :3].mT @ found[:3, :3])) < 0.3
+    off = (transform_points(found, torch.zeros(1, 3).double()) - middle)[0]
+    assert off[:2].norm() < 1  # of 5
+    assert off[2].abs() < 5  # one view hardly tells the depth

@@ -3,19 +3,33 @@
 Blocks of two 3 × 3 convolutions, each followed by ReLU and then batch normalisation, beside a 1 × 1 convolution of the
 block's input; down by 2 × 2 convolutions of stride 2, up by transposed ones. The landmark head takes the features and
 the class logits through two 1 × 1 convolutions with nothing between them. Three things differ, so that it is trained,
-read and measured as `models.unet` is: logits are averaged over 2 × 2 pixels; heat maps are logits of a distribution;
+decoded and measured as `models.unet` is: logits are averaged over 2 × 2 pixels; heat maps are logits of a distribution;
 and that distribution has a learned constant for "not in the image", which the original leaves to a test of the map.
 """
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from models.unet import Prediction, UNetConfig
+from models.protocols import Prediction
 
-_HIDDEN = 21  # width between the landmark head's two convolutions
+_HIDDEN = 21  # channels between the landmark head's two convolutions
+
+
+@dataclass(frozen=True)
+class Grupp2020Settings:
+    """Everything that fixes the network's shape."""
+
+    classes: int  # of the segmentation, the background included
+    landmarks: int
+    channels: tuple[int, ...] = (32, 64, 128, 256, 512, 1024)  # per level; by default as published
+
+    def build(self) -> "Grupp2020":
+        """A new network with random weights."""
+        return Grupp2020(self)
 
 
 class _Block(nn.Module):
@@ -31,26 +45,22 @@ class _Block(nn.Module):
         return self.body(features) + self.shortcut(features)
 
 
-class ReferenceUNet(nn.Module):
-    """Takes images (B, 1, H, W) of mean 0 and deviation 1 each; H and W are multiples of 2^(levels − 1).
+class Grupp2020(nn.Module):
+    """Maps images (B, 1, H, W), H and W multiples of 2^(levels − 1), to a `Prediction`."""
 
-    Of the configuration, `channels` per level (32, 64, … 1024 in the paper), `classes` and `landmarks` count.
-    """
-
-    def __init__(self, config: UNetConfig) -> None:
+    def __init__(self, settings: Grupp2020Settings) -> None:
         super().__init__()
-        self.config = config
-        widths = config.channels
+        widths = settings.channels
         self.encoder = nn.ModuleList(_Block(*sizes) for sizes in pairwise((1, *widths)))
         self.down = nn.ModuleList(nn.Conv2d(width, width, 2, stride=2) for width in widths[:-1])
         self.up = nn.ModuleList(nn.ConvTranspose2d(b, a, 2, stride=2) for a, b in pairwise(widths))
         self.decoder = nn.ModuleList(_Block(2 * width, width) for width in widths[:-1])
-        self.segmentation = nn.Conv2d(widths[0], config.classes, 1, bias=False)
+        self.segmentation = nn.Conv2d(widths[0], settings.classes, 1, bias=False)
         self.heatmaps = nn.Sequential(
-            nn.Conv2d(widths[0] + config.classes, _HIDDEN, 1, bias=False),
-            nn.Conv2d(_HIDDEN, config.landmarks, 1, bias=False),
+            nn.Conv2d(widths[0] + settings.classes, _HIDDEN, 1, bias=False),
+            nn.Conv2d(_HIDDEN, settings.landmarks, 1, bias=False),
         )
-        self.absence = nn.Parameter(torch.zeros(config.landmarks))
+        self.absence = nn.Parameter(torch.zeros(settings.landmarks))
 
     def forward(self, image: Tensor) -> Prediction:
         skips = []

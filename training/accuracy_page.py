@@ -1,0 +1,98 @@
+"""An accuracy as files: every figure with its interval as JSON, and a page to read."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from femoreg_torch.anatomy import HIP
+from femoreg_torch.files import write_json, write_text
+from training.accuracy import COARSE, FAIR, GROSS_MM, NEAR_MM, REGISTERED_DEG, Accuracy, Measure, summarise
+from training.calibration import RIGHT_MM, calibration_error, draw_reliability
+from training.measure import Reading
+from training.robustness import Outcomes
+
+_SHARE, _MM = "share", "mm"
+_ROWS = {  # figure → what it is called, and its unit
+    "median_mm": ("landmark error, median", _MM),
+    "mean_mm": ("landmark error, mean", _MM),
+    "p90_mm": ("landmark error, 90th percentile", _MM),
+    "gross": (f"found further than {GROSS_MM:g} mm off", _SHARE),
+    "recall": ("recall: found of those in the image", _SHARE),
+    "within_10mm": (f"found within {NEAR_MM:g} mm, of those in the image", _SHARE),
+    "false_positives": ("false positives: found of those not in the image", _SHARE),
+    **{f"dice_{bone}": (f"Dice, {bone.replace('_', ' ')}", "") for bone in HIP.bone_names},
+    "dice_mean": (f"Dice, mean of {len(HIP.bones)}", ""),
+    "pose_fair": ("pose within {:g}°, {:g} mm across, {:g} mm in depth".format(*FAIR), _SHARE),
+    "pose_coarse": ("pose within {:g}°, {:g} mm, {:g} mm".format(*COARSE), _SHARE),
+    "pose_refused": ("pose refused", _SHARE),
+    "registered_1deg": (f"pelvis within {REGISTERED_DEG:g}° after single-view registration", _SHARE),
+    "rotation_median_deg": ("rotation error, median", "°"),
+}
+
+
+def write_accuracy(out: Path, readings: Sequence[Reading], altered: Mapping[str, Outcomes]) -> str:
+    """Write `accuracy.json`, `accuracy.md` and `reliability.png` into the folder `out`; returns the page.
+
+    `altered` says what became of start poses in altered images; empty where that was not measured.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    accuracy = summarise(readings)
+    error = calibration_error(readings)
+    outcomes = {name: asdict(counted) for name, counted in altered.items()}
+    write_json(out / "accuracy.json", {**asdict(accuracy), "calibration_error": error, "altered": outcomes})
+    draw_reliability(readings, out / "reliability.png")
+    page = "\n".join([*_figures(accuracy), "", *_calibration(error), *_altered(altered)]) + "\n"
+    write_text(out / "accuracy.md", page)
+    return page
+
+
+def _figures(accuracy: Accuracy) -> list[str]:
+    """All figures with 95 % intervals, then the landmarks one by one."""
+    lines = [
+        f"{accuracy.images} images of {accuracy.patients} patients. Errors are on the detector; brackets hold the 95 % "
+        "interval by bootstrap over patients.",
+        "",
+        "| | |",
+        "| --- | --- |",
+        *(f"| {name} | {_value(accuracy.measures[key], unit)} |" for key, (name, unit) in _ROWS.items()),
+        "",
+        "| landmark | mean, mm | median, mm | recall | in the image |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for name, one in accuracy.landmarks.items():
+        lines.append(
+            f"| {name} | {one.mean_mm:.1f} | {one.median_mm:.1f} | {100 * one.recall:.0f} % | {one.in_image} |"
+        )
+    return lines
+
+
+def _calibration(error: float) -> list[str]:
+    return [
+        "A confidence is the probability that the landmark is in the image and within "
+        f"{RIGHT_MM:g} mm of where it was found. Stated and true share differ by {100 * error:.1f} % in the mean "
+        "(reliability.png)."
+    ]
+
+
+def _altered(altered: Mapping[str, Outcomes]) -> list[str]:
+    if not altered:
+        return []
+    good = "{:g}°, {:g} mm and {:g} mm".format(*COARSE)
+    return [
+        "",
+        f"Start poses in altered images; a good one is within {good}, a silent failure is any other that is given.",
+        "",
+        "| images | good | refused | silent failure |",
+        "| --- | --- | --- | --- |",
+        *(f"| {name} | {one.good} | {one.refused} | {one.silent_failures} |" for name, one in altered.items()),
+    ]
+
+
+def _value(measure: Measure, unit: str) -> str:
+    if math.isnan(measure.value):
+        return "–"
+    if unit == _SHARE:
+        return f"{100 * measure.value:.1f} % ({100 * measure.low:.1f} to {100 * measure.high:.1f})"
+    digits = 1 if unit else 2
+    return f"{measure.value:.{digits}f} {unit}".rstrip() + f" ({measure.low:.{digits}f} to {measure.high:.{digits}f})"
