@@ -1,14 +1,20 @@
-"""Nothing half-written is left behind, and nothing else is touched."""
+"""Nothing half-written is left behind, whenever a run is killed, and nothing else is touched."""
 
 import json
+import os
+import random
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from femoreg_torch import files
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import new_folder, read_json, write_json, write_text
+from femoreg_torch.files import new_folder, read_json, temporary_file, write_json, write_text
 
 
 def names(folder: Path) -> list[str]:
@@ -56,6 +62,175 @@ def test_only_what_was_built_is_replaced(tmp_path: Path) -> None:
     assert (run / "result.json").read_text() == "new"
     assert names(run / "pictures") == ["new.png"]
     assert names(tmp_path) == ["run"]
+
+
+@pytest.fixture(params=["exchange", "two renames"])
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """How a folder is replaced: as this system can, or as where two folders cannot be exchanged."""
+    if request.param == "two renames":
+        monkeypatch.setattr(files, "exchange", lambda first, second: False)
+    return request.param
+
+
+def test_what_is_kept_is_linked_and_looks_as_before(tmp_path: Path, way: str) -> None:
+    run = tmp_path / "run"
+    (run / "deep" / "er").mkdir(parents=True)
+    large = run / "deep" / "er" / "ct.nii.gz"
+    large.write_bytes(bytes(1 << 20))
+    (run / "deep" / "to the large one").symlink_to("er/ct.nii.gz")
+    (run / "elsewhere").symlink_to(tmp_path / "no such file")
+    (run / "a folder").symlink_to("deep")
+    (run / "report.html").write_text("of the old result")
+    run.chmod(0o750)
+    inode = large.stat().st_ino
+    with new_folder(run, without=["report.html", "not there"]) as built:
+        (built / "result.json").write_text("new")
+        (built / "elsewhere").write_text("a file now")
+    assert names(run) == ["a folder", "deep", "elsewhere", "result.json"]
+    assert large.stat().st_ino == inode
+    assert (run / "deep" / "to the large one").readlink() == Path("er/ct.nii.gz")
+    assert (run / "a folder").readlink() == Path("deep")
+    assert not (run / "elsewhere").is_symlink()
+    assert run.stat().st_mode & 0o777 == 0o750
+    assert names(tmp_path) == ["run"]
+
+
+def test_where_there_are_no_links_files_are_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_link(*_: object, **__: object) -> None:
+        raise OSError(1, "Operation not permitted")
+
+    (tmp_path / "run" / "deep").mkdir(parents=True)
+    (tmp_path / "run" / "deep" / "ct.nii.gz").write_text("a CT")
+    (tmp_path / "run" / "link").symlink_to("deep")
+    monkeypatch.setattr(os, "link", no_link)
+    with new_folder(tmp_path / "run") as built:
+        (built / "result.json").write_text("new")
+    assert (tmp_path / "run" / "deep" / "ct.nii.gz").read_text() == "a CT"
+    assert (tmp_path / "run" / "link").readlink() == Path("deep")
+
+
+def test_a_folder_by_another_name_is_replaced_where_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    (tmp_path / "real" / "run").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("real/run")
+    monkeypatch.chdir(tmp_path / "real" / "run")
+    for number, path in enumerate((Path(), Path("no/.."), tmp_path / "link")):
+        with new_folder(path) as built:
+            (built / f"{number}.txt").write_text("new")
+        assert Path(f"{number}.txt").read_text() == "new"  # a relative path means the new folder
+    assert (tmp_path / "link").is_symlink()
+    assert names(tmp_path / "real" / "run") == ["0.txt", "1.txt", "2.txt"]
+    assert names(tmp_path / "real") == ["run"]
+
+
+def test_what_cannot_be_replaced_as_a_whole_is_told_before_anything_is_done() -> None:
+    with pytest.raises(InputError, match="/proc: is a mount point"), new_folder(Path("/proc")):
+        raise AssertionError("not reached")
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from femoreg_torch import files
+
+if sys.argv[2] == "two renames":
+    files.exchange = lambda first, second: False
+
+def write(text):
+    with files.new_folder(Path(sys.argv[1])) as built:
+        for name in ("result.json", "deep/navigation.json"):
+            (built / name).parent.mkdir(exist_ok=True)
+            (built / name).write_text(text)
+"""
+EVERY_STEP = (
+    WRITER
+    + """
+import os, signal
+
+def killed_at(step):
+    count = 0
+    def hook(event, arguments):
+        nonlocal count
+        count += 1
+        if count == step:
+            os.kill(os.getpid(), signal.SIGKILL)
+    child = os.fork()
+    if child == 0:
+        sys.addaudithook(hook)
+        write("new")
+        os._exit(0)
+    return os.waitpid(child, 0)[1] == signal.SIGKILL
+
+step = 1
+write("old")
+while killed_at(step):
+    found = [path.read_text() for path in sorted(Path(sys.argv[1]).glob("**/*.json"))]
+    print(step, *found, flush=True)
+    write("old")
+    step += 1
+"""
+)
+FOR_EVER = (
+    WRITER
+    + """
+for number in range(10**9):
+    write(str(number))
+    print(number, flush=True)
+"""
+)
+
+
+def test_killed_at_every_step_a_writer_leaves_all_old_or_all_new(tmp_path: Path, way: str) -> None:
+    """Python tells of each call to the system before it is made: there the writer is killed, one step later each time.
+
+    Between two renames, where folders cannot be exchanged, there is nothing; the next writer finds the old folder.
+    """
+    run = tmp_path / "run"
+    done = subprocess.run(
+        [sys.executable, "-c", EVERY_STEP, str(run), way], capture_output=True, encoding="utf-8", check=True
+    )
+    found = [tuple(line.split()[1:]) for line in done.stdout.splitlines()]
+    assert found.count(("old", "old")) > 10
+    assert found.count(("new", "new")) > 3
+    allowed = {("old", "old"), ("new", "new")} | ({()} if way == "two renames" else set())
+    assert set(found) == allowed
+    assert names(tmp_path) == ["run"]  # the last writer removed what the killed ones had left
+
+
+def test_killed_at_any_moment_a_writer_leaves_files_that_agree(tmp_path: Path, way: str) -> None:
+    run, moments = tmp_path / "run", random.Random(0)
+    for _ in range(60):
+        with subprocess.Popen([sys.executable, "-c", FOR_EVER, str(run), way], stdout=subprocess.PIPE) as writer:
+            assert writer.stdout is not None
+            writer.stdout.readline()
+            time.sleep(moments.uniform(0, 0.02))
+            writer.kill()
+        with new_folder(run) as built:  # brings an old folder back that was renamed away
+            (built / "notes.txt").write_text("mine")
+        assert (run / "result.json").read_text() == (run / "deep" / "navigation.json").read_text()
+        assert names(tmp_path) == ["run"]
+
+
+def test_what_a_live_writer_builds_is_not_taken_for_a_leftover(tmp_path: Path) -> None:
+    with new_folder(tmp_path / "run") as first, temporary_file(tmp_path / "run.json") as file:
+        (first / "a.txt").write_text("first")
+        file.write_text("{}")
+        with new_folder(tmp_path / "run") as second, temporary_file(tmp_path / "run.json") as again:
+            (second / "b.txt").write_text("second")
+            again.write_text("[]")
+    assert names(tmp_path / "run") == ["a.txt", "b.txt"]
+    assert (tmp_path / "run.json").read_text() == "{}"
+    assert names(tmp_path) == ["run", "run.json"]
+
+
+@pytest.mark.parametrize("name", ["lock", "new", "old"])
+def test_no_name_is_special(tmp_path: Path, name: str) -> None:
+    write_text(tmp_path / name, "text")
+    assert (tmp_path / name).read_text() == "text"
+    with new_folder(tmp_path / "run") as built:
+        write_text(built / name, "text")
+    assert names(tmp_path / "run") == [name]
 
 
 def test_a_file_in_the_place_of_a_folder(tmp_path: Path) -> None:

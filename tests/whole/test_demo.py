@@ -1,0 +1,125 @@
+"""The demo from end to end, its accuracy, and the same procedure under other label ids and with other presets."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import femoreg_torch as femoreg
+from femoreg_torch.anatomy import HIP, LabelTable, label_table
+from femoreg_torch.commands.main import main
+from femoreg_torch.volume import read_label_map, write_volume
+
+# Of one simulated procedure, mm: the accuracy study's largest errors are a third of these.
+LIMITS = {"pelvis": 0.5, "femur": 1.0, "device": 0.5, "view2": 0.5, "view3": 0.5}
+ONE_STEP = """
+extends: fast
+steps:
+  - {name: "femur in view 1, coarse", remove: true}
+  - {name: pelvis and femur in view 1, remove: true}
+  - {name: anatomy in all views, remove: true}
+  - {name: "C-arm of the other views, coarse", remove: true}
+  - {name: "device in all views, coarse", remove: true}
+  - {name: everything together, remove: true}
+  - {name: "everything together, fine", remove: true}
+  - name: pelvis in view 1, coarse
+    level: {pixel_mm: 6.2, step_mm: 3}
+    optimiser: {kind: levenberg_marquardt, candidates: 0, max_iterations: 1}
+"""
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("demo") / "demo"
+    assert main(["demo", "--out", str(out)]) == 0
+    return out
+
+
+def result_of(run: Path) -> dict[str, Any]:
+    return json.loads((run / "result.json").read_text(encoding="utf-8"))
+
+
+def test_the_demo_finds_femur_and_device(demo: Path) -> None:
+    result = result_of(demo / "run")
+    assert result["trusted"] is True
+    assert result["reasons"] == result["skipped"] == []
+    for name, limit in LIMITS.items():
+        assert result["errors"][name]["mm"] < limit, name
+    assert result["errors"]["relative_mm"] < 1.0
+    assert result["errors"]["path_deg"] < 1.0
+
+
+def test_the_demo_writes_all_that_it_says(demo: Path) -> None:
+    names = {path.name for path in (demo / "run").iterdir()}
+    assert names == {"result.json", "navigation.json", "navigation", "errors.json", "overlay.png", "report.html"}
+    text = (demo / "run" / "report.html").read_text(encoding="utf-8")
+    assert "Trusted: every check of the registration passed." in text
+    errors = json.loads((demo / "run" / "errors.json").read_text(encoding="utf-8"))
+    assert errors["femur"]["mm"] == pytest.approx(result_of(demo / "run")["errors"]["femur"]["mm"], abs=1e-6)
+
+
+def permuted(case: femoreg.Case, table: LabelTable, path: Path) -> femoreg.Case:
+    """The case with a label map of other ids."""
+    assert case.labels_path is not None
+    labels = read_label_map(case.labels_path)
+    data = torch.zeros_like(labels.data, dtype=torch.int32)
+    for bone, ids in case.bones.items():
+        data[labels.data == ids[0]] = table[bone][0]
+    write_volume(path, labels.with_data(data.to(torch.uint8)))
+    return replace(case, labels_path=path, bones=table)
+
+
+@pytest.mark.parametrize("table", ["totalsegmentator_v2", "totalsegmentator_v1", "permuted"])
+def test_other_label_ids_give_the_same_scene_bit_for_bit(demo: Path, tmp_path: Path, table: str) -> None:
+    """The registration is a function of the scene and the seed, so that it is the same as well."""
+    case = femoreg.read_case(demo / "case")
+    ids = (
+        {bone: (7 * n % 31 + 1,) for n, bone in enumerate(HIP.bone_names, 1)}
+        if table == "permuted"
+        else label_table(table)
+    )
+    ours, theirs = (femoreg.prepare_scene(c) for c in (case, permuted(case, ids, tmp_path / "labels.nii.gz")))
+    for name, thing in ours.objects.items():
+        other = theirs.objects[name]
+        assert torch.equal(thing.volume.data, other.volume.data), name
+        assert torch.equal(thing.volume.lps_from_index, other.volume.lps_from_index), name
+        assert torch.equal(thing.reference_point, other.reference_point), name
+        assert thing.classes == other.classes
+    assert ours.outline is not None
+    assert theirs.outline is not None
+    assert ours.outline.bones == theirs.outline.bones == HIP.outline
+    assert torch.equal(ours.outline.mask.data, theirs.outline.mask.data)
+
+
+def test_a_result_that_is_not_trusted_ends_in_status_3_if_trust_is_required(demo: Path, tmp_path: Path) -> None:
+    """A preset of one's own that hardly looks: its result says that it must not be trusted."""
+    (tmp_path / "one_step.yaml").write_text(ONE_STEP)
+    arguments = ["register", str(demo / "case"), "--preset", str(tmp_path / "one_step.yaml"), "--out"]
+    assert main([*arguments, str(tmp_path / "run"), "--require-trust"]) == 3
+    result = result_of(tmp_path / "run")
+    assert result["trusted"] is False
+    assert result["reasons"]
+    assert main(["navigate", str(tmp_path / "run")]) == 0
+    assert json.loads((tmp_path / "run" / "navigation.json").read_text())["trusted"] is False
+
+
+def test_a_registration_starts_where_a_file_says(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "one_step.yaml").write_text(ONE_STEP)
+    arguments = ["register", str(demo / "case"), "--preset", str(tmp_path / "one_step.yaml"), "--out"]
+    start = ["--start", str(demo / "run" / "result.json")]
+    assert main([*arguments, str(tmp_path / "run"), *start]) == 0
+    begun, found = (result_of(run) for run in (tmp_path / "run", demo / "run"))
+    assert begun["start"]["source"] == "poses that were given"
+    torch.testing.assert_close(
+        torch.tensor(begun["start"]["camera1_from_pelvis"]),
+        torch.tensor(found["camera_from_pelvis"][0]),
+        atol=1e-6,
+        rtol=0,
+    )
+    assert any("outlines" in note for note in begun["skipped"])
+    assert "outlines" in capsys.readouterr().out
