@@ -9,7 +9,7 @@ setup: .venv/.installed
 # done again only when the dependencies changed
 .venv/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --editable '.[dev]' --constraint constraints.txt
+	$(BIN)/python -m pip install --quiet --editable '.[all,dev]' --constraint constraints.txt
 	touch $@
 
 demo: setup
@@ -37,18 +37,14 @@ PRESET ?= fast
 JOBS ?= 1
 TIMED ?= 5
 
-.venv/.study: .venv/.installed
-	$(BIN)/python -m pip install --quiet --editable '.[dev,study]' --constraint constraints.txt
-	touch $@
-
-accuracy: .venv/.study
+accuracy: setup
 	$(BIN)/python -m sim.study accuracy --preset $(PRESET) --jobs $(JOBS) --timed $(TIMED) --docs docs
 
-capture-range: .venv/.study
+capture-range: setup
 	$(BIN)/python -m sim.study capture-range --preset $(PRESET) --docs docs
 
-trust: .venv/.study
+trust: setup
 	$(BIN)/python -m sim.study trust --preset $(PRESET) --docs docs
 
-ablation: .venv/.study
+ablation: setup
 	$(BIN)/python -m sim.study ablation --jobs $(JOBS) --docs docs
