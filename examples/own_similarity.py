@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from own_stages import PLAN
-from phantom_parts import lumpy_object, noisy
+from phantom_parts import MIDDLE, two_views
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -71,23 +71,9 @@ class Powell:
 def main() -> tuple[float, float]:
     """Register one object to two images by one's own similarity and optimiser; returns degrees and mm off."""
     stage = replace(PLAN.stages[1], similarity=MutualInformation(bins=24), optimiser=Powell())
-    carm, volume = femoreg.load_carm("cios_fusion"), lumpy_object()
-    cameras = carm.orbit(torch.deg2rad(torch.tensor([0.0, 40.0], dtype=torch.float64)))
-    truth = torch.eye(4, dtype=torch.float64)
-    truth[:3, 3] = torch.tensor([5.0, -8.0, 640.0])
-    camera = carm.camera.downsampled(8)
-    images = femoreg.project(volume, cameras @ truth, camera, step_mm=0.5)
-    start = truth.clone()
-    start[:3, 3] += torch.tensor([1.5, -1.0, 3.0])
-    middle = torch.zeros(3, dtype=torch.float64)
-    scene = femoreg.Scene(
-        femoreg.CArm(camera, carm.isocentre_mm, carm.orbit_axis),
-        {"object": femoreg.RigidObject(volume, middle, ("image",), femoreg.Start(camera1_from=start))},
-        {"image": tuple(noisy(image, seed) for seed, image in enumerate(images))},
-        camera_from_camera1=cameras,
-    )
+    scene, truth = two_views(8, (1.5, -1.0, 3.0))
     outcome = femoreg.run_plan(scene, femoreg.Plan("mine", (stage,)), None, seed=1)
-    off = pose_difference(truth, outcome.poses.camera1_from["object"], middle)
+    off = pose_difference(truth, outcome.poses.camera1_from["object"], MIDDLE)
     print(f"{off[0]:.2f}° and {off[1]:.2f} mm off after {outcome.trace[0].evaluations} evaluations")
     return off
 

@@ -35,6 +35,6 @@ def binning(pixel_mm: float, camera: Camera) -> int:
 
     The edge of pixels that are no squares is the geometric mean of their sides.
     """
-    ratio = pixel_mm / math.sqrt(camera.pixel_mm[0] * camera.pixel_mm[1])
+    ratio = pixel_mm / camera.mean_pixel_mm
     below = max(1, math.floor(ratio))
     return below if ratio**2 <= below * (below + 1) else below + 1

@@ -55,7 +55,7 @@ def assert_same(a: Any, b: Any) -> None:
     """Equal dataclasses, mappings and values, tensors to the decimals that are written."""
     if isinstance(a, torch.Tensor):
         assert a.dtype == b.dtype == torch.float64
-        torch.testing.assert_close(a, b, atol=1e-7, rtol=0)
+        torch.testing.assert_close(a, b, atol=1e-8, rtol=0)
     elif is_dataclass(a):
         for name in vars(a):
             assert_same(getattr(a, name), getattr(b, name))

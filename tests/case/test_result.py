@@ -89,7 +89,7 @@ def test_a_result_comes_back(tmp_path: Path, names: tuple[str, str, str]) -> Non
     again = read_result(tmp_path)
     assert list(again.poses.camera1_from) == list(names)
     for name in names:
-        torch.testing.assert_close(again.poses.camera_from(name), result.poses.camera_from(name), atol=1e-7, rtol=0)
+        torch.testing.assert_close(again.poses.camera_from(name), result.poses.camera_from(name), atol=1e-8, rtol=0)
     assert again.verdict == result.verdict
     assert again.verdict.trusted
     assert again.path == (other, tool)
