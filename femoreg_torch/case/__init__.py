@@ -1,7 +1,7 @@
 """Case folders and results: one directory describes one procedure, and every command reads and writes it."""
 
-from femoreg_torch.case.model import Case, CaseObject, Model, PlannedPath, Side, Start, View
-from femoreg_torch.case.quality import ObjectQuality, ViewQuality
+from femoreg_torch.case.model import Case, CaseObject, Model, Part, PlannedPath, Side, Start, View
+from femoreg_torch.case.quality import CameraQuality, ObjectQuality, ViewQuality
 from femoreg_torch.case.reading import read_case
 from femoreg_torch.case.result import LandmarkRecord, Result, StartRecord
 from femoreg_torch.case.result_file import RESULT_NAME, read_result, result_content
@@ -12,11 +12,13 @@ from femoreg_torch.files import new_folder, write_json, write_text
 
 __all__ = [
     "RESULT_NAME",
+    "CameraQuality",
     "Case",
     "CaseObject",
     "LandmarkRecord",
     "Model",
     "ObjectQuality",
+    "Part",
     "PlannedPath",
     "Result",
     "Side",

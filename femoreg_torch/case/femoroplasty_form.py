@@ -22,10 +22,12 @@ from femoreg_torch.case.femoroplasty import (
 )
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.model import Case, Side, View
-from femoreg_torch.case.objects import check_guide, checked_path, read_model
+from femoreg_torch.case.models import MODEL_KEYS, read_model
+from femoreg_torch.case.objects import check_guide, checked_path
 from femoreg_torch.case.parts import (
     read_bones,
     read_carm,
+    read_field,
     read_intensity,
     read_known_pose,
     read_truth,
@@ -127,7 +129,7 @@ def _target(plan: Fields, landmarks: dict[str, torch.Tensor], side: Side) -> tor
 
 
 def _device(device: Fields, folder: Path) -> Device:
-    device.only("model", "volume", "labels", "hu", "points", f"camera1_from_{DEVICE}")
+    device.only(*MODEL_KEYS, "points", f"camera1_from_{DEVICE}")
     named = device.mapping("points").only(*DEVICE_POINTS)
     points = {name: named.point(name) for name in DEVICE_POINTS}
     check_guide(points, named.where("tip"))
@@ -135,8 +137,8 @@ def _device(device: Fields, folder: Path) -> Device:
 
 
 def _view(view: Fields, folder: Path) -> View:
-    view.only(ANATOMY_IMAGES, DEVICE_IMAGES, "intensity", "camera_from_camera1")
+    view.only(ANATOMY_IMAGES, DEVICE_IMAGES, "intensity", "camera_from_camera1", "field")
     images = {ANATOMY_IMAGES: view.file_path(ANATOMY_IMAGES, folder)}
     if DEVICE_IMAGES in view:
         images[DEVICE_IMAGES] = view.file_path(DEVICE_IMAGES, folder)
-    return View(images, read_intensity(view), read_known_pose(view))
+    return View(images, read_intensity(view), read_known_pose(view), read_field(view, folder))

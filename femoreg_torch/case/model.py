@@ -1,6 +1,7 @@
 """What one procedure consists of: rigid objects, fluoroscopic images, and how each object starts."""
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -8,7 +9,10 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import Anatomy, LabelTable
+from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import Circle, Polygon
 from femoreg_torch.geometry import CArm, Poses
+from femoreg_torch.volume.materials import material_hu
 
 Side = Literal["left", "right"]
 Intensity = Literal["raw", "log"]  # raw: bone dark, as a detector counts; log: attenuation, bone bright
@@ -23,7 +27,7 @@ class Start:
 
     camera1_from: Tensor | None = None  # (4, 4) nominal pose in camera 1
     beside: str | None = None  # the name of another object
-    beside_from_object: Tensor = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
+    beside_from_object: Tensor = dataclasses.field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
 
     @property
     def by_landmarks(self) -> bool:
@@ -32,12 +36,60 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Model:
-    """What an object looks like if it is no bone: a closed mesh, a labelled volume, or (`hu` None) a volume in HU."""
+class Part:
+    """A solid of one material: a closed mesh, a body of a file of several, or labelled voxels.
+
+    Either `hu` or `material` is given.
+    """
 
     path: Path
+    hu: float | None = None  # of its material
+    labels: tuple[int, ...] | None = None  # of its voxels in a labelled volume
+    material: str | None = None  # by name, see `volume/materials.py`
+    body: str | None = None  # its name in a file of several bodies
+    name: str | None = None  # for the reader of the case
+
+    def __post_init__(self) -> None:
+        if (self.hu is None) == (self.material is None):
+            raise InputError(f"part {self.path.name}: either `hu` or `material` was expected.")
+
+    @property
+    def solid_hu(self) -> float:
+        """HU of its material. Raises `InputError` for a material that is not known."""
+        if self.material is not None:
+            return material_hu(self.material)
+        assert self.hu is not None  # seen when it was made
+        return self.hu
+
+
+@dataclass(frozen=True)
+class Model:
+    """What an object looks like if it is no bone.
+
+    One solid of `hu` or of a named `material`, several solids (`parts`), or, with none of the three, a volume in HU.
+    """
+
+    path: Path  # of the mesh or volume; of parts in files of their own, that of the first
     hu: float | None  # of its material
     labels: tuple[int, ...] | None = None  # of its voxels in a labelled volume
+    material: str | None = None  # by name
+    parts: tuple[Part, ...] = ()  # in order: where two overlap, the later one replaces the earlier
+
+    def __post_init__(self) -> None:
+        if (self.hu is not None) + (self.material is not None) + bool(self.parts) > 1:
+            raise InputError(f"model {self.path.name}: has two of `hu`, `material` and `parts`. Keep one of them.")
+
+    @property
+    def solids(self) -> tuple[Part, ...]:
+        """All solids; none for a volume in HU."""
+        if self.parts or (self.hu is None and self.material is None):
+            return self.parts
+        return (Part(self.path, self.hu, self.labels, self.material),)
+
+    @property
+    def materials_known(self) -> bool:
+        """Whether materials were named, or told for each part. A single HU may be a guess."""
+        return self.material is not None or bool(self.parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +100,9 @@ class CaseObject:
     bones: tuple[str, ...] = ()  # of the CT's label map: names in the case's `bones`, or groups of the anatomy
     model: Model | None = None  # or a model of its own
     reference: Tensor | None = None  # (3,) where errors are told and rotations turn about; None: middle of its box
-    points: dict[str, Tensor] = field(default_factory=dict)  # named points
+    points: dict[str, Tensor] = dataclasses.field(default_factory=dict)  # named points
     images: tuple[str, ...] | None = None  # kinds of images that show it; None: all
-    start: Start = field(default_factory=Start)
+    start: Start = dataclasses.field(default_factory=Start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +122,7 @@ class View:
     images: dict[str, Path]
     intensity: Intensity = "raw"
     camera_from_camera1: Tensor | None = None  # (4, 4) where the C-arm's pose is known
+    field: Circle | Polygon | Path | None = None  # what shutters leave of all its images, or a mask; None: looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +136,8 @@ class Case:
     anatomy: Anatomy | None = None  # the body part, where it is a known one
     ct_path: Path | None = None
     labels_path: Path | None = None
-    bones: LabelTable = field(default_factory=dict)  # ids in the label map of bones, or of groups of bones
-    landmarks: dict[str, Tensor] = field(default_factory=dict)  # (3,) each, LPS
+    bones: LabelTable = dataclasses.field(default_factory=dict)  # ids in the label map of bones, or of groups of bones
+    landmarks: dict[str, Tensor] = dataclasses.field(default_factory=dict)  # (3,) each, LPS
     plan: PlannedPath | None = None
     truth: Poses | None = None
     template: str | None = None  # what `case.yaml` is a short form of

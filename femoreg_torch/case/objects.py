@@ -7,14 +7,13 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import Anatomy, LabelTable
-from femoreg_torch.anatomy.tables import label_ids
 from femoreg_torch.case.fields import Fields
-from femoreg_torch.case.model import CaseObject, Model, PlannedPath, Start
+from femoreg_torch.case.model import CaseObject, PlannedPath, Start
+from femoreg_torch.case.models import MODEL_KEYS, is_model, read_model
 from femoreg_torch.errors import InputError
 
-VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")  # of a model given as voxels
 _BY_LANDMARKS = "landmarks"
-_RESERVED = ("all", "each", "view", "views", "camera1")  # words of presets, and of names of poses
+_RESERVED = ("all", "each", "view", "views", "intrinsics", "camera1")  # words of presets, and of names of poses
 
 
 def read_object(
@@ -29,9 +28,7 @@ def read_object(
 
     Raises `InputError` that names file and key for whatever does not fit.
     """
-    entry = entries.mapping(name).only(
-        "bones", "model", "volume", "labels", "hu", "reference", "points", "images", "start"
-    )
+    entry = entries.mapping(name).only("bones", *MODEL_KEYS, "reference", "points", "images", "start")
     if not name.isidentifier() or name in _RESERVED:
         raise InputError(
             f"{entries.where(name)}: a name of letters, digits and _ was expected, other than {', '.join(_RESERVED)}; "
@@ -42,8 +39,10 @@ def read_object(
         named = entry.mapping("points")
         points = {key: named.point(key) for key in named.content}
     from_ct = "bones" in entry
-    if from_ct == ("model" in entry or "volume" in entry):
-        raise InputError(f"{entries.where(name)}: either `bones` of the CT or a `model` or `volume` was expected.")
+    if from_ct == is_model(entry):
+        raise InputError(
+            f"{entries.where(name)}: either `bones` of the CT or a `model`, `volume` or `parts` was expected."
+        )
     return CaseObject(
         name=name,
         bones=_bones(entry, bones, anatomy) if from_ct else (),
@@ -96,38 +95,6 @@ def _start(entry: Fields) -> Start:
     if "beside_from_object" not in start:
         return Start(beside=beside)
     return Start(beside=beside, beside_from_object=start.transform("beside_from_object"))
-
-
-def read_model(entry: Fields, folder: Path) -> Model:
-    """The mesh under `model`, or the `volume` with its `labels`; `hu` is the material's. Raises `InputError`."""
-    path, labels = _model_file(entry, folder)
-    return Model(path, entry.number("hu") if "model" in entry or labels else None, labels)
-
-
-def _model_file(entry: Fields, folder: Path) -> tuple[Path, tuple[int, ...] | None]:
-    """The mesh or the volume, and the labels of its voxels if it is a labelled volume."""
-    if "model" in entry and "volume" in entry:
-        raise InputError(f"{entry.where('volume')}: `model` (a mesh) is given too. Keep one of the two.")
-    if "volume" not in entry:
-        if "labels" in entry:
-            raise InputError(f"{entry.where('labels')}: only a `volume` has labels, found `model` (a mesh).")
-        path = entry.file_path("model", folder)
-        if path.name.lower().endswith(VOLUME_SUFFIXES):
-            raise InputError(f"{entry.where('model')}: a mesh was expected, found {path.name}. Give it as `volume`.")
-        return path, None
-    path = entry.file_path("volume", folder)
-    if not path.name.lower().endswith(VOLUME_SUFFIXES):
-        raise InputError(
-            f"{entry.where('volume')}: a volume ({', '.join(VOLUME_SUFFIXES)}) was expected, found {path.name}. "
-            "Give a mesh as `model`."
-        )
-    if "labels" in entry:
-        return path, label_ids(entry.value("labels", "a list of label ids"), entry.where("labels"))
-    if "hu" in entry:
-        raise InputError(
-            f"{entry.where('hu')}: a `volume` without `labels` holds HU itself. Name the labels, or drop `hu`."
-        )
-    return path, None
 
 
 def read_plan(plan: Fields, objects: Mapping[str, CaseObject], landmarks: Mapping[str, Tensor]) -> PlannedPath:

@@ -13,6 +13,7 @@ from femoreg_torch.case.model import Intensity, View
 from femoreg_torch.case.poses import poses_from
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json
+from femoreg_torch.fluoro import Circle, Polygon
 from femoreg_torch.geometry import CArm, Poses, carm_from_dict, load_carm
 from femoreg_torch.volume.segments import segment_names
 
@@ -113,7 +114,7 @@ def read_carm(top: Fields) -> CArm:
 
 def read_view(view: Fields, folder: Path) -> View:
     """A view with `image`, or with `images` by kind."""
-    view.only("image", "images", "intensity", "camera_from_camera1")
+    view.only("image", "images", "intensity", "camera_from_camera1", "field")
     if "images" in view and "image" in view:
         raise InputError(f"{view.where('image')}: `images` is given too. Keep one of the two.")
     if "images" in view:
@@ -123,7 +124,31 @@ def read_view(view: Fields, folder: Path) -> View:
         images = {ONE_KIND: view.file_path("image", folder)}
     if not images:
         raise InputError(f"{view.where('images')}: is empty. Name at least one image.")
-    return View(images, read_intensity(view), read_known_pose(view))
+    return View(images, read_intensity(view), read_known_pose(view), read_field(view, folder))
+
+
+def read_field(view: Fields, folder: Path) -> Circle | Polygon | Path | None:
+    """What shutters leave of a view's images: `{circle: …}`, `{polygon: …}` or the file of a mask; None: not said."""
+    if "field" not in view:
+        return None
+    if isinstance(view.content["field"], str):
+        return view.file_path("field", folder)
+    field = view.mapping("field").only("circle", "polygon")
+    if ("circle" in field) == ("polygon" in field):
+        raise InputError(f"{view.where('field')}: `circle`, `polygon` or the file of a mask was expected.")
+    if "circle" in field:
+        circle = field.mapping("circle").only("centre", "radius")
+        column, row = circle.numbers("centre", 2)
+        radius = circle.number("radius")
+        if radius <= 0:
+            raise InputError(f"{circle.where('radius')}: a positive number of pixels was expected, found {radius:g}.")
+        return Circle((column, row), radius)
+    corners = field.value("polygon", "a list of corners [column, row]")
+    if not isinstance(corners, list) or len(corners) < 3:
+        raise InputError(f"{field.where('polygon')}: at least three corners [column, row] were expected.")
+    items = Fields({f"polygon[{n}]": corner for n, corner in enumerate(corners)}, field.file, field.path)
+    pairs = (items.numbers(name, 2) for name in items.content)
+    return Polygon(tuple((column, row) for column, row in pairs))
 
 
 def read_intensity(view: Fields) -> Intensity:

@@ -25,3 +25,13 @@ class ObjectQuality:
     displacement: tuple[float, float] | None  # degrees, mm from where it was expected, at the reference point
     trusted: bool
     reason: str
+
+
+@dataclass(frozen=True)
+class CameraQuality:
+    """The camera that a view was registered with, and how well images and C-arm file together know it."""
+
+    sdd_mm: float
+    principal_point_px: tuple[float, float]  # column, row of the images as stored
+    sdd_deviation_mm: float  # standard deviations
+    principal_point_deviation_px: tuple[float, float]

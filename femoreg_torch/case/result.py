@@ -6,7 +6,7 @@ from typing import Any
 from torch import Tensor
 
 from femoreg_torch.case.model import Case
-from femoreg_torch.case.quality import ObjectQuality
+from femoreg_torch.case.quality import CameraQuality, ObjectQuality
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.case.verdict import Verdict, verdict_on
 from femoreg_torch.geometry import Poses, invert_rigid, transform_points
@@ -41,6 +41,7 @@ class Result:
     poses: Poses  # its first object is the one that the C-arm's poses are told by
     quality: dict[str, ObjectQuality]
     start: StartRecord | None = None
+    cameras: tuple[CameraQuality, ...] = ()  # of every view, where they were refined
     stages: tuple[StageRecord, ...] = ()
     skipped: tuple[str, ...] = ()  # what was left out, and why, in words
     path: tuple[str, str | None] | None = None  # the object with the planned path, and the tool that is to follow it

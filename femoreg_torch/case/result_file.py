@@ -1,7 +1,7 @@
 """`RUN/result.json`: a `Result` as JSON, and back."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +9,12 @@ from torch import Tensor
 
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.poses import poses_content
-from femoreg_torch.case.quality import ObjectQuality, ViewQuality
+from femoreg_torch.case.quality import CameraQuality, ObjectQuality, ViewQuality
 from femoreg_torch.case.result import LandmarkRecord, Result, StartRecord
-from femoreg_torch.case.trace import Moment, Restart, StageRecord, moments_content
+from femoreg_torch.case.trace import Moment, Restart, StageRecord, changes_content, moments_content
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json
-from femoreg_torch.geometry import Poses, poses_by_object
+from femoreg_torch.geometry import CameraChange, Poses, poses_by_object
 
 RESULT_NAME = "result.json"
 SCHEMA = 2
@@ -27,12 +27,15 @@ def result_content(result: Result) -> dict[str, Any]:
     content: dict[str, Any] = {"version": SCHEMA, **poses_content(result.poses, result.anchor)}
     if result.path is not None and result.object_from_tool is not None:
         content[f"{result.path[0]}_from_{result.path[1]}"] = result.object_from_tool
+    if result.poses.changes:
+        content["carm_refined"] = _cameras_content(result)
     content |= {
         "points_camera1": result.points_camera1,
         "directions_camera1": result.directions_camera1,
         "quality": {name: asdict(value) for name, value in result.quality.items()},
         "trusted": result.verdict.trusted,
         "reasons": result.verdict.reasons,
+        "doubts": result.doubts,
         "skipped": result.skipped,
     }
     if result.start is not None:
@@ -49,6 +52,12 @@ def result_content(result: Result) -> dict[str, Any]:
     if result.case is not None:
         content["case"] = result.case
     return content
+
+
+def _cameras_content(result: Result) -> list[dict[str, Any]]:
+    """Every view's change against the C-arm's file, with the camera that it leads to where that is told."""
+    cameras: list[dict[str, Any]] = [asdict(camera) for camera in result.cameras] or [{} for _ in result.poses.changes]
+    return [camera | asdict(change) for camera, change in zip(cameras, result.poses.changes, strict=True)]
 
 
 def _start_content(start: StartRecord) -> dict[str, Any]:
@@ -72,6 +81,7 @@ def _stage_content(stage: StageRecord) -> dict[str, Any]:
         "stop": stage.stop,
         "camera_from_camera1": stage.poses.camera_from_camera1,
         "camera1_from": stage.poses.camera1_from,
+        **changes_content(stage.poses),
         "moments": moments_content(stage.moments),
     }
 
@@ -89,6 +99,7 @@ def read_result(run: Path) -> Result:
         poses=poses,
         quality=_quality(top),
         start=_start(top.mapping("start")) if "start" in top else None,
+        cameras=_cameras(top),
         stages=tuple(_stages(top, poses)),
         skipped=tuple(top.texts("skipped", "a list of sentences")) if top.content.get("skipped") else (),
         path=_path(top, names),
@@ -106,13 +117,15 @@ def read_result(run: Path) -> Result:
 
 def _doubts(top: Fields) -> list[str]:
     """What speaks against a result that was read, besides the quality of its objects."""
-    doubts = []
+    doubts = top.texts("doubts", "a list of sentences") if top.content.get("doubts") else []
     version = top.content.get("version")
     if version not in _KNOWN or isinstance(version, bool):
         known = " and ".join(map(str, _KNOWN))
         doubts.append(f"its format is of version {str(version)[:20]}, and this FemoReg Torch knows {known}")
-    if top.content.get("trusted") is not True and all(
-        isinstance(q, dict) and q.get("trusted") is True for q in _mapping(top, "quality").values()
+    if (
+        top.content.get("trusted") is not True
+        and not doubts
+        and all(isinstance(q, dict) and q.get("trusted") is True for q in _mapping(top, "quality").values())
     ):
         doubts.append("the registration does not say that it can be trusted")
     return doubts
@@ -127,7 +140,40 @@ def _poses(top: Fields) -> Poses:
         )
     others = [key for key in top.content if key.startswith("camera1_from_")]
     in_camera1 = {key.removeprefix("camera1_from_"): top.transform(key) for key in others}
-    return poses_by_object(top.transforms(anchors[0]), anchors[0].removeprefix("camera_from_"), in_camera1)
+    poses = poses_by_object(top.transforms(anchors[0]), anchors[0].removeprefix("camera_from_"), in_camera1)
+    return replace(poses, changes=_changes(top, len(poses.camera_from_camera1)))
+
+
+def _changes(fields: Fields, views: int) -> tuple[CameraChange, ...]:
+    """How the cameras differ from the C-arm's file; nothing where they were not refined."""
+    if "carm_refined" not in fields:
+        return ()
+    found = fields.mappings("carm_refined")
+    if len(found) != views:
+        raise InputError(f"{fields.where('carm_refined')}: {views} views were expected, found {len(found)}.")
+    return tuple(_change(camera) for camera in found)
+
+
+def _change(camera: Fields) -> CameraChange:
+    x, y = camera.numbers("principal_point_shift_mm", 2)
+    factor = camera.number("sdd_factor")
+    if not factor > 0:
+        raise InputError(f"{camera.where('sdd_factor')}: a positive number was expected, found {factor}.")
+    return CameraChange(factor, (x, y))
+
+
+def _cameras(top: Fields) -> tuple[CameraQuality, ...]:
+    found = top.mappings("carm_refined") if "carm_refined" in top else []
+    return tuple(
+        CameraQuality(
+            camera.number("sdd_mm"),
+            _several(camera, "principal_point_px", 2),
+            _number(camera, "sdd_deviation_mm"),
+            _several(camera, "principal_point_deviation_px", 2),
+        )
+        for camera in found
+        if "sdd_mm" in camera
+    )
 
 
 def _path(top: Fields, names: Sequence[str]) -> tuple[str, str | None] | None:
@@ -244,7 +290,7 @@ def _several(fields: Fields, key: str, count: int) -> Any:
 def _stages(top: Fields, poses: Poses) -> list[StageRecord]:
     stages = []
     for stage in top.mappings("stages") if "stages" in top else []:
-        placed = _placed(stage, poses)
+        placed = _placed(stage, replace(poses, changes=()))
         stages.append(
             StageRecord(
                 name=stage.text("name", "the name of the stage"),
@@ -271,7 +317,9 @@ def _placed(fields: Fields, otherwise: Poses) -> Poses:
     """The poses of a stage or a moment; those that it does not tell are `otherwise`."""
     poses = otherwise
     if "camera_from_camera1" in fields:
-        poses = Poses(fields.transforms("camera_from_camera1"), poses.camera1_from)
+        poses = replace(poses, camera_from_camera1=fields.transforms("camera_from_camera1"))
+    if "carm_refined" in fields:
+        poses = replace(poses, changes=_changes(fields, len(poses.camera_from_camera1)))
     placed = fields.mapping("camera1_from")
     for name in placed.content:
         poses = poses.with_object(name, placed.transform(name))

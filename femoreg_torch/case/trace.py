@@ -1,6 +1,6 @@
 """What every step of a registration did, as a result holds it."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
@@ -42,6 +42,11 @@ class StageRecord:
     moving: tuple[str, ...] = ()  # the objects that it moved, all of them with a C-arm
 
 
+def changes_content(poses: Poses) -> dict[str, Any]:
+    """How the cameras differ from the C-arm's file, as the result holds it; nothing where they were not refined."""
+    return {"carm_refined": [asdict(change) for change in poses.changes]} if poses.changes else {}
+
+
 def moments_content(moments: tuple[Moment, ...]) -> list[dict[str, Any]]:
     """Moments as the result holds them: of the poses, those alone that change along the way."""
     if not moments:
@@ -57,6 +62,7 @@ def moments_content(moments: tuple[Moment, ...]) -> list[dict[str, Any]]:
         {
             "evaluations": moment.evaluations,
             "cost": moment.cost,
+            **changes_content(moment.poses),
             **({"camera_from_camera1": moment.poses.camera_from_camera1} if views_move else {}),
             "camera1_from": {name: moment.poses.camera1_from[name] for name in moving},
         }

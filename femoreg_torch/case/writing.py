@@ -11,12 +11,13 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import LabelTable, label_table, label_table_names
 from femoreg_torch.case.femoroplasty import DEVICE, Device, device_of, femoral_head
-from femoreg_torch.case.model import Case, CaseObject, Model, PlannedPath, Start, View
+from femoreg_torch.case.model import Case, CaseObject, Model, Part, PlannedPath, Start, View
 from femoreg_torch.case.parts import ONE_KIND
 from femoreg_torch.case.poses import poses_content
 from femoreg_torch.case.reading import VERSIONS
 from femoreg_torch.configs import preset_names
 from femoreg_torch.files import plain, write_json, write_text
+from femoreg_torch.fluoro import Circle, Polygon
 from femoreg_torch.geometry import CArm, load_carm
 from femoreg_torch.volume import write_landmarks
 
@@ -91,13 +92,25 @@ def _device(device: Device, folder: Path) -> dict[str, Any]:
 
 
 def _model(model: Model, folder: Path) -> dict[str, Any]:
-    is_volume = model.labels is not None or model.hu is None
-    content: dict[str, Any] = {"volume" if is_volume else "model": _relative(model.path, folder)}
-    if model.labels is not None:
-        content["labels"] = list(model.labels)
-    if model.hu is not None:
-        content["hu"] = model.hu
-    return content
+    if not model.solids:  # a volume in HU
+        return {"volume": _relative(model.path, folder)}
+    if not model.parts:
+        return _solid(model.solids[0], folder)
+    if all(part.body is not None for part in model.parts):
+        bodies = {part.body: _material(part) for part in model.parts}
+        return {"model": _relative(model.path, folder), "parts": bodies}
+    return {"parts": [_solid(part, folder) for part in model.parts]}
+
+
+def _solid(part: Part, folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = {"model" if part.labels is None else "volume": _relative(part.path, folder)}
+    if part.labels is not None:
+        content["labels"] = list(part.labels)
+    return content | _material(part) | ({} if part.name is None else {"name": part.name})
+
+
+def _material(part: Part) -> dict[str, Any]:
+    return {"hu": part.hu} if part.material is None else {"material": part.material}
 
 
 def _object(thing: CaseObject, folder: Path) -> dict[str, Any]:
@@ -129,7 +142,19 @@ def _view(view: View, folder: Path, short: bool) -> dict[str, Any]:
     images = {kind: _relative(path, folder) for kind, path in view.images.items()}
     content: dict[str, Any] = images if short or list(images) == [ONE_KIND] else {"images": images}
     pose = {} if view.camera_from_camera1 is None else {"camera_from_camera1": view.camera_from_camera1}
-    return content | {"intensity": view.intensity} | pose
+    return content | {"intensity": view.intensity} | pose | _field(view, folder)
+
+
+def _field(view: View, folder: Path) -> dict[str, Any]:
+    match view.field:
+        case None:
+            return {}
+        case Circle(centre, radius):
+            return {"field": {"circle": {"centre": list(centre), "radius": radius}}}
+        case Polygon(corners):
+            return {"field": {"polygon": [list(corner) for corner in corners]}}
+        case path:
+            return {"field": _relative(path, folder)}
 
 
 def _carm(carm: CArm) -> str | dict[str, Any]:
@@ -137,4 +162,5 @@ def _carm(carm: CArm) -> str | dict[str, Any]:
     for name in preset_names("carm"):
         if load_carm(name) == carm:
             return name
-    return asdict(carm.camera) | {"isocentre_mm": carm.isocentre_mm, "orbit_axis": carm.orbit_axis}
+    settings = {key: value for key, value in asdict(carm).items() if key != "camera"}
+    return asdict(carm.camera) | settings

@@ -29,10 +29,10 @@ def detect(
     from rich.console import Console
 
     from femoreg_torch.detect import detect as find
-    from femoreg_torch.detect import load_network
+    from femoreg_torch.detect import filled, load_network, within_field
     from femoreg_torch.detect.writing import write_detections
     from femoreg_torch.errors import InputError
-    from femoreg_torch.fluoro import attenuation_image, check_matches, read_image
+    from femoreg_torch.fluoro import attenuation_image, check_matches, exposed_field, read_image
     from femoreg_torch.geometry import load_carm
     from femoreg_torch.pnp import MINIMUM
 
@@ -45,18 +45,24 @@ def detect(
     stored = [read_image(path) for path in images]
     for path, image in zip(images, stored, strict=True):
         check_matches(image, camera, f"{path}:")
-    attenuation = [attenuation_image(image) if intensity == "raw" else image for image in stored]
-    detections = [find(network, image, camera) for image in attenuation]
+    attenuation, detections = [], []
+    for image in stored:
+        field = exposed_field(image if intensity == "raw" else (-image).exp(), camera)
+        shown = attenuation_image(image, field) if intensity == "raw" else image
+        shown = shown if field is None else filled(shown, field)
+        found = find(network, shown, camera)
+        attenuation.append(shown)
+        detections.append(found if field is None else within_field(found, field))
     write_detections(out, images, attenuation, detections, camera)
     console = Console()
     for path, detection in zip(images, detections, strict=True):
-        found = int(detection.visible.sum())
+        count = int(detection.visible.sum())
         remarks = [
             *(["standing on its head"] if detection.turned else []),
             *(["grey values inverted"] if detection.inverted else []),
-            *([f"not enough landmarks for a start pose, which takes {MINIMUM}"] if found < MINIMUM else []),
+            *([f"not enough landmarks for a start pose, which takes {MINIMUM}"] if count < MINIMUM else []),
         ]
-        console.print(", ".join([f"{path}: {found} of {len(detection.visible)} landmarks", *remarks]))
+        console.print(", ".join([f"{path}: {count} of {len(detection.visible)} landmarks", *remarks]))
 
 
 def _files(path: Path) -> list[Path]:

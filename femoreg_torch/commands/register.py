@@ -61,7 +61,7 @@ def register(
     tool = None if procedure.plan is None else procedure.plan.tool
     calibration = None if robot is None or tool is None else read_robot(robot, tool)
     if robot is not None and (tool is None or not _is_seen(procedure, tool)):
-        raise InputError(f"{case}: --robot was given, but there is no tool to steer, or a view has no image of it.")
+        raise InputError(f"{case}: --robot was given, but there is no tool to steer, or no view has an image of it.")
     with progress_report(console, "reading the case") as report:
         result, scene = register_scene(
             procedure,
@@ -89,5 +89,4 @@ def register(
 
 
 def _is_seen(case: "Case", tool: str) -> bool:
-    kinds = case.objects[tool].images or case.kinds
-    return any(all(kind in view.images for view in case.views) for kind in kinds)
+    return any(kind in view.images for kind in case.objects[tool].images or case.kinds for view in case.views)

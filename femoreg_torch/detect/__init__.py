@@ -1,6 +1,7 @@
 """Finding bones and landmarks in a fluoroscopic image."""
 
 from femoreg_torch.detect.decode import decode_heatmaps
+from femoreg_torch.detect.field import filled, within_field
 from femoreg_torch.detect.grid import image_from_network, network_camera, to_network_grid
 from femoreg_torch.detect.network import Detection, detect
 from femoreg_torch.detect.normalise import normalise
@@ -11,9 +12,11 @@ __all__ = [
     "LandmarkNetwork",
     "decode_heatmaps",
     "detect",
+    "filled",
     "image_from_network",
     "load_network",
     "network_camera",
     "normalise",
     "to_network_grid",
+    "within_field",
 ]

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from femoreg_torch.drr import cpu, cuda
 from femoreg_torch.drr.bricks import bricked
-from femoreg_torch.drr.moments import affine_gradient, jacobian
+from femoreg_torch.drr.moments import affine_gradient, jacobian, unit_rays
 from femoreg_torch.drr.reference import march
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry.camera import Camera
@@ -58,13 +58,21 @@ def project(
 
 
 def project_with_jacobian(
-    volume: Volume, camera_from_volume: Tensor, camera: Camera, centre: Tensor, step_mm: float = 1.0
+    volume: Volume,
+    camera_from_volume: Tensor,
+    camera: Camera,
+    centre: Tensor,
+    step_mm: float = 1.0,
+    *,
+    intrinsics: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Images (B, H, W) of one volume and their derivatives (B, H, W, 6) with respect to a twist in the camera frame.
 
     The twist moves the object after its pose: about `centre` (3,) in mm in the camera frame, along the camera's axes,
-    (rotation in rad, translation in mm), taken at zero. `camera_from_volume` is (B, 4, 4). On the CPU, or on CUDA with
-    Triton; raises `InputError` where it cannot.
+    (rotation in rad, translation in mm), taken at zero. With `intrinsics`, three more columns (B, H, W, 9) are the
+    derivatives by the intrinsics: the logarithm of the source distance, and the principal point along x and y in mm on
+    the detector. `camera_from_volume` is (B, 4, 4). On the CPU, or on CUDA with Triton; raises
+    `InputError` where it cannot.
     """
     _check([volume], camera_from_volume[:, None])
     with torch.no_grad():
@@ -72,6 +80,21 @@ def project_with_jacobian(
         affines = index_from_camera[:, :3]
         # To move the object is to move the camera's points in it the other way.
         changes = -affines[:, None] @ _twist_generators(centre.to(index_from_camera))
+        if intrinsics:
+            changes = torch.cat([changes, affines[:, None] @ _ray_generators(camera).to(index_from_camera)], 1)
+    image, derivatives = _with_derivatives(volume, affines, changes, camera, step_mm)
+    if not intrinsics:
+        return image, derivatives
+    turned, stretched = derivatives[..., :9], derivatives[..., 9:]
+    rays = unit_rays(camera).to(image.device)
+    shares = torch.einsum("hwi,nij,hwj->hwn", rays, _ray_generators(camera)[:3, :3, :3].to(rays), rays)
+    return image, torch.cat([turned[..., :6], turned[..., 6:] - shares * stretched], -1)
+
+
+def _with_derivatives(
+    volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, step_mm: float
+) -> tuple[Tensor, Tensor]:
+    """Images (B, H, W) and their derivatives (B, H, W, n) by parameters that change the affines by (B, n, 3, 4)."""
     if volume.data.device.type == "cpu":
         image, moments = cpu.projection_with_moments(bricked(volume), affines.numpy(), camera, step_mm)
         return torch.from_numpy(image), jacobian(torch.from_numpy(moments), camera, changes)
@@ -87,6 +110,20 @@ def _twist_generators(centre: Tensor) -> Tensor:
     generators[:3, :3, :3] = skew(axes)
     generators[:3, :3, 3] = -skew(axes) @ centre
     generators[3:, :3, 3] = axes
+    return generators
+
+
+def _ray_generators(camera: Camera) -> Tensor:
+    """How the rays change with the intrinsics, and a stretch: (4, 4, 4) float64.
+
+    The ray through a pixel runs along w = (x, y, f) with the source distance f. It changes by M w: M = e_z e_zᵀ with
+    log f, and −e_x e_zᵀ / f and −e_y e_zᵀ / f with the principal point. Samples lie along the unit vector u = w / |w|,
+    which changes by M u − (uᵀ M u) u; the last part is that of the stretch, M = 1.
+    """
+    generators = torch.zeros(4, 4, 4, dtype=torch.float64)
+    generators[0, 2, 2] = 1
+    generators[1, 0, 2] = generators[2, 1, 2] = -1 / camera.sdd_mm
+    generators[3, :3, :3] = torch.eye(3)
     return generators
 
 

@@ -13,6 +13,7 @@ from femoreg_torch.drr import project
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
 from femoreg_torch.registration import Scene
+from femoreg_torch.registration.scene import Kind
 from femoreg_torch.volume import Volume
 
 GREEN, RED, _MAGENTA = (0, 255, 0), (60, 60, 255), (255, 60, 255)  # blue, green, red
@@ -24,19 +25,22 @@ Picture = NDArray[np.uint8]
 def overlay_figure(case: Case, scene: Scene, poses: Poses) -> Picture:
     """A column per view (H, W, 3), a row per kind of images, with edges of the objects that this kind shows first.
 
-    Landmarks of the CT and the planned path are drawn on the first row.
+    A panel without an image is black. Landmarks of the CT and the planned path are drawn on the first row.
     """
     factor = max(1, scene.carm.camera.shape[1] // _WIDTH_PX)
-    camera = scene.carm.camera.downsampled(factor)
+    cameras = [poses.camera(view, scene.carm.camera.downsampled(factor)) for view in range(scene.views)]
     rows = []
     for kind, names in new_objects(scene).items():
         panels = []
         for view, image in enumerate(scene.images[kind]):
-            panel = monitor_picture(downsample(image, factor))
+            if image is None:
+                panels.append(np.zeros((*cameras[view].shape, 3), np.uint8))
+                continue
+            panel = monitor_picture(downsample(image, factor), small_field(scene, kind, view, factor))
             placed = [name for name in names if name in poses.camera1_from]
-            draw_edges(panel, [(scene.objects[n].volume, poses.camera_from(n)[view]) for n in placed], camera)
+            draw_edges(panel, [(scene.objects[n].volume, poses.camera_from(n)[view]) for n in placed], cameras[view])
             if kind == scene.first_kind:
-                _draw_plan(panel, case, scene.anchor, poses, view, camera)
+                _draw_plan(panel, case, scene.anchor, poses, view, cameras[view])
             panels.append(panel)
         rows.append(np.hstack(panels))
     return np.vstack(rows)
@@ -84,10 +88,20 @@ def _draw_plan(picture: Picture, case: Case, anchor: str, poses: Poses, view: in
         cv2.line(picture, start, end, _MAGENTA, 1, cv2.LINE_AA)
 
 
-def monitor_picture(attenuation: Tensor) -> Picture:
-    """An attenuation image (H, W) as a monitor shows it (bone dark), grey (H, W, 3)."""
+def small_field(scene: Scene, kind: Kind, view: int, factor: int) -> Tensor | None:
+    """The exposed pixels of an image averaged by a whole factor; None where all are."""
+    field = scene.field(kind, view)
+    return None if field is None else downsample(field, factor) > 0.5
+
+
+def monitor_picture(attenuation: Tensor, field: Tensor | None = None) -> Picture:
+    """An attenuation image (H, W) as a monitor shows it (bone dark), grey (H, W, 3).
+
+    The exposed `field` (H, W), bool, sets its window; by default the whole image.
+    """
     values = attenuation.numpy()
-    body = values[values > 0.15 * values.max()]  # the direct beam must not set the window
+    exposed = values if field is None else values[field.numpy()]
+    body = exposed[exposed > 0.15 * exposed.max()]  # the direct beam must not set the window
     low, high = np.percentile(body, [1, 99.8])
     shown = ((high - values) / max(high - low, 1e-6) * 255).clip(0, 255).astype(np.uint8)
     return np.repeat(shown[..., None], 3, axis=2)

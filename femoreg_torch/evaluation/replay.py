@@ -15,13 +15,13 @@ from femoreg_torch.case import Case, Result, Verdict
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation.fit import check_fits
-from femoreg_torch.evaluation.overlay import GREEN, RED, Picture, edges_of, monitor_picture, new_objects
+from femoreg_torch.evaluation.overlay import GREEN, RED, Picture, edges_of, monitor_picture, new_objects, small_field
 from femoreg_torch.files import temporary_file
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, Poses
 from femoreg_torch.registration import Scene, prepare_scene
 from femoreg_torch.registration.scene import Kind
-from femoreg_torch.similarity import FixedSimilarity, GradNcc
+from femoreg_torch.similarity import FixedSimilarity, GradNcc, against_field
 
 _PANEL_PX = 256  # width of one image, or a little more: the detector is averaged over whole blocks
 _BAR_PX = 22  # height of a line of text
@@ -111,7 +111,7 @@ def _verdict(verdict: Verdict) -> tuple[str, tuple[int, int, int]]:
 def draw_frames(
     case: Case, scene: Scene, frames: list[Frame], verdict: tuple[str, tuple[int, int, int]]
 ) -> Iterator[Picture]:
-    """Pictures (H, W, 3) of frames: a column per view, anatomy above and device below, lines of text around them.
+    """Pictures (H, W, 3) of frames: a column per view, a row per kind of images, lines of text around them.
 
     `verdict` is told on the last one.
     """
@@ -122,9 +122,12 @@ def draw_frames(
     similarities: dict[tuple[Kind, int], FixedSimilarity] = {}
     for kind, images in scene.images.items():
         for number, image in enumerate(images):
+            if image is None:
+                continue
             small = downsample(image, factor)
-            backgrounds[kind, number] = monitor_picture(small)
-            similarities[kind, number] = GradNcc(_PATCH_RADIUS).against(small, None)
+            field = small_field(scene, kind, number, factor)
+            backgrounds[kind, number] = monitor_picture(small, field)
+            similarities[kind, number] = against_field(GradNcc(_PATCH_RADIUS), small, None, field)
     renderer = _Renderer(scene, camera)
     for index, frame in enumerate(frames):
         rows = []
@@ -133,6 +136,8 @@ def draw_frames(
             edged = [name for name in new[kind] if name in drawn]
             panels = [
                 _panel(backgrounds[kind, view].copy(), view, edged, drawn, frame, renderer, similarities[kind, view])
+                if (kind, view) in backgrounds
+                else np.zeros((*camera.shape, 3), np.uint8)
                 for view in range(scene.views)
             ]
             rows.append(np.hstack(panels))
@@ -148,15 +153,17 @@ class _Renderer:
 
     def __init__(self, scene: Scene, camera: Camera) -> None:
         self._scene, self._camera = scene, camera
-        self._last: dict[tuple[str, int], tuple[Tensor, Tensor]] = {}
+        self._last: dict[tuple[str, int], tuple[Camera, Tensor, Tensor]] = {}
 
     def __call__(self, poses: Poses, name: str, view: int) -> Tensor:
         """Line integrals (H, W) of one object in one view."""
         camera_from_object = poses.camera_from(name)[view]
-        where, drawn = self._last.get((name, view), (None, None))
-        if drawn is None or where is None or not torch.equal(where, camera_from_object):
-            drawn = project([self._scene.objects[name].volume], camera_from_object[None, None], self._camera)[0]
-            self._last[name, view] = (camera_from_object, drawn)
+        camera = poses.camera(view, self._camera)
+        last = self._last.get((name, view))
+        if last is not None and last[0] == camera and torch.equal(last[1], camera_from_object):
+            return last[2]
+        drawn = project([self._scene.objects[name].volume], camera_from_object[None, None], camera)[0]
+        self._last[name, view] = (camera, camera_from_object, drawn)
         return drawn
 
 

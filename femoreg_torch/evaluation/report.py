@@ -49,6 +49,8 @@ def report_page(case: Case, result: Result, errors: dict[str, Any] | None, overl
         ]
     parts += ["<h2>Overlays</h2>", _figure(overlay, case), "<h2>Result</h2>", _points(result)]
     parts += ["<h2>Quality</h2>", _QUALITY_NOTE, _table(_QUALITY_COLUMNS, _quality(result))]
+    if result.cameras:
+        parts += ["<h2>C-arm</h2>", _CAMERA_NOTE, _table(_CAMERA_COLUMNS, _cameras(result))]
     parts += ["<h2>Time</h2>", _table(("step", "s"), ([k, f"{v:.1f}"] for k, v in result.timings_s.items()))]
     parts += ["<h2>Versions</h2>", _table(("", ""), ([k, v] for k, v in result.versions.items()))]
     body = "\n".join(parts)
@@ -134,6 +136,22 @@ def _quality(result: Result) -> Iterable[list[str]]:
             _number(sum(similarities) / len(similarities) if similarities else math.nan, 3),
             _number(min(gains, default=math.nan), 3),
         ]
+
+
+_CAMERA_NOTE = (
+    "<p>Source distance and principal point were refined together with the poses, as far as the C-arm's file is "
+    "uncertain of them; with standard deviations.</p>"
+)
+_CAMERA_COLUMNS = ("view", "source distance mm", "±", "column px", "±", "row px", "±")
+
+
+def _cameras(result: Result) -> Iterable[list[str]]:
+    """A row for every view."""
+    for number, camera in enumerate(result.cameras, 1):
+        column, row = camera.principal_point_px
+        column_deviation, row_deviation = camera.principal_point_deviation_px
+        values = (camera.sdd_mm, camera.sdd_deviation_mm, column, column_deviation, row, row_deviation)
+        yield [str(number), *(_number(value, 1) for value in values)]
 
 
 def _number(value: float, digits: int) -> str:

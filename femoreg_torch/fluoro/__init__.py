@@ -1,6 +1,20 @@
-"""Fluoroscopic images: files, attenuation and coarser grids."""
+"""Fluoroscopic images: files, the exposed field, attenuation and coarser grids."""
 
+from femoreg_torch.fluoro.collimation import Shutter, exposed_field, find_shutter, without_penumbra
+from femoreg_torch.fluoro.field import Circle, Polygon
 from femoreg_torch.fluoro.intensity import attenuation_image, downsample
 from femoreg_torch.fluoro.reading import check_matches, read_image, write_image
 
-__all__ = ["attenuation_image", "check_matches", "downsample", "read_image", "write_image"]
+__all__ = [
+    "Circle",
+    "Polygon",
+    "Shutter",
+    "attenuation_image",
+    "check_matches",
+    "downsample",
+    "exposed_field",
+    "find_shutter",
+    "read_image",
+    "without_penumbra",
+    "write_image",
+]

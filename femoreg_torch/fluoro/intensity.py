@@ -11,18 +11,19 @@ from femoreg_torch.errors import InputError
 _SIGMA_PX = math.sqrt(2.0)  # of the smoothing that finds I0: variance 2 px², as xReg does (itkIntensLogTrans)
 
 
-def attenuation_image(raw: Tensor) -> Tensor:
+def attenuation_image(raw: Tensor, field: Tensor | None = None) -> Tensor:
     """Attenuation −log(I / I0) of a raw image (H, W), bone bright, dimensionless.
 
-    I0, the unattenuated beam, is the maximum of a lightly smoothed copy, so that no single hot pixel sets it; where a
-    pixel counts more, its attenuation is slightly negative. Pixels of zero or less count as the smallest positive
-    pixel. Raises `InputError` if no pixel is positive.
+    I0, the unattenuated beam, is the maximum of a lightly smoothed copy within the exposed `field` (H, W), bool (None:
+    all of it), so that no single hot pixel sets it; where a pixel counts more, its attenuation is slightly negative.
+    Pixels of zero or less count as the smallest positive pixel. Raises `InputError` if no pixel is positive.
     """
     positive = raw[raw > 0]
     if positive.numel() == 0:
         raise InputError("image: no pixel is positive, a raw intensity image was expected. Is its intensity `log`?")
     smooth = cv2.GaussianBlur(raw.float().numpy(), (0, 0), _SIGMA_PX, borderType=cv2.BORDER_REPLICATE)
-    return math.log(float(smooth.max())) - raw.float().clamp_min(positive.min().item()).log()
+    open_beam = smooth.max() if field is None else smooth[field.numpy()].max()
+    return math.log(float(open_beam)) - raw.float().clamp_min(positive.min().item()).log()
 
 
 def downsample(image: Tensor, factor: int) -> Tensor:

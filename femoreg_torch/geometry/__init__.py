@@ -1,7 +1,7 @@
 """Rigid transforms, cameras and the C-arm's orbit. Conventions: docs/conventions.md."""
 
-from femoreg_torch.geometry.camera import Camera, centred_camera, project_points
-from femoreg_torch.geometry.carm import CArm, carm_from_dict, load_carm, orbit_angles
+from femoreg_torch.geometry.camera import Camera, CameraChange, centred_camera, project_points
+from femoreg_torch.geometry.carm import CArm, Uncertainty, carm_from_dict, load_carm, orbit_angles
 from femoreg_torch.geometry.poses import Poses, first_view_only, poses_by_object
 from femoreg_torch.geometry.rigid import (
     about_point,
@@ -21,7 +21,9 @@ from femoreg_torch.geometry.rigid import (
 __all__ = [
     "CArm",
     "Camera",
+    "CameraChange",
     "Poses",
+    "Uncertainty",
     "about_point",
     "carm_from_dict",
     "centred_camera",

@@ -14,6 +14,19 @@ from femoreg_torch.errors import InputError
 
 
 @dataclass(frozen=True)
+class CameraChange:
+    """How a camera differs from what a C-arm's file says, on whatever grid of pixels."""
+
+    sdd_factor: float = 1.0
+    principal_point_shift_mm: tuple[float, float] = (0.0, 0.0)  # on the detector, along columns and rows
+
+    def then(self, other: "CameraChange") -> "CameraChange":
+        """Both, one after the other."""
+        (x, y), (dx, dy) = self.principal_point_shift_mm, other.principal_point_shift_mm
+        return CameraChange(self.sdd_factor * other.sdd_factor, (x + dx, y + dy))
+
+
+@dataclass(frozen=True)
 class Camera:
     """Intrinsics of one detector (or of a window or coarser grid on it)."""
 
@@ -30,6 +43,16 @@ class Camera:
     def mean_pixel_mm(self) -> float:
         """Edge of a square pixel with the same area, on the detector."""
         return math.sqrt(self.pixel_mm[0] * self.pixel_mm[1])
+
+    def changed(self, change: CameraChange) -> "Camera":
+        """The same grid of pixels seen from another source."""
+        x, y = change.principal_point_shift_mm
+        column, row = self.principal_point_px
+        return replace(
+            self,
+            sdd_mm=self.sdd_mm * change.sdd_factor,
+            principal_point_px=(column + x / self.pixel_mm[1], row + y / self.pixel_mm[0]),
+        )
 
     def downsampled(self, factor: int) -> "Camera":
         """The camera of an image averaged over `factor` × `factor` blocks: c' = (c + 0.5) / factor − 0.5.

@@ -1,7 +1,7 @@
 """The C-arm: a camera that orbits about an isocentre, and its presets."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,31 @@ from femoreg_torch.geometry.rigid import about_point, exp_so3, rigid
 
 
 @dataclass(frozen=True)
+class Uncertainty:
+    """How well a C-arm's intrinsics are known: standard deviations.
+
+    The source distance is one for all views, as the arm holds it. The principal point is that of each view by itself,
+    as the arm sags differently in every pose. The defaults are those of a C-arm that nobody has calibrated: a nominal
+    distance is told to the housing or to the detector's plane, which differ by about 2 % of it, and arms sag by about
+    2 mm. Zero holds a value.
+    """
+
+    sdd_percent: float = 2.0
+    principal_point_mm: float = 2.0  # along each axis of the detector
+
+    def __post_init__(self) -> None:
+        if not (self.sdd_percent >= 0 and self.principal_point_mm >= 0):
+            raise InputError(f"uncertainty of a C-arm: standard deviations must not be negative, got {self}.")
+
+
+@dataclass(frozen=True)
 class CArm:
     """A C-arm: its camera and, in the camera frame, the axis that its orbit turns about."""
 
     camera: Camera
     isocentre_mm: tuple[float, float, float]  # in the camera frame; the orbit axis passes through it
     orbit_axis: tuple[float, float, float]  # unit vector in the camera frame
+    uncertainty: Uncertainty = Uncertainty()  # of the camera
 
     def orbit(self, angle_rad: Tensor) -> Tensor:
         """`moved_camera_from_camera` (..., 4, 4) after the C-arm has turned by `angle_rad` (...) along its orbit.
@@ -34,12 +53,13 @@ class CArm:
 
 
 def carm_from_dict(settings: dict[str, Any], where: str) -> CArm:
-    """A C-arm from `{sdd_mm, pixel_mm, shape, principal_point_px, isocentre_mm, orbit_axis}`.
+    """A C-arm from `{sdd_mm, pixel_mm, shape, principal_point_px, isocentre_mm, orbit_axis, uncertainty}`.
 
-    The last three may be left out: centre of the detector, (0, 0, 0.62 · sdd_mm) (the ratio of the Cios Fusion) and +y.
+    The last four may be left out: centre of the detector, (0, 0, 0.62 · sdd_mm) (the ratio of the Cios Fusion), +y, and
+    what `Uncertainty` has for a C-arm that nobody has calibrated; a mapping with its keys.
     Raises `InputError` that names `where` and the key.
     """
-    known = {"sdd_mm", "pixel_mm", "shape", "principal_point_px", "isocentre_mm", "orbit_axis"}
+    known = {"sdd_mm", "pixel_mm", "shape", "principal_point_px", "isocentre_mm", "orbit_axis", "uncertainty"}
     if unknown := sorted(set(settings) - known):
         raise InputError(f"{where}: unknown key {unknown[0]!r}. Known keys: {', '.join(sorted(known))}.")
     for key in ("sdd_mm", "pixel_mm", "shape"):
@@ -57,7 +77,23 @@ def carm_from_dict(settings: dict[str, Any], where: str) -> CArm:
     length = math.sqrt(sum(v * v for v in axis))
     if not length > 0:
         raise InputError(f"{where}.orbit_axis: must not be zero.")
-    return CArm(camera, (x, y, z), (axis[0] / length, axis[1] / length, axis[2] / length))
+    unit = (axis[0] / length, axis[1] / length, axis[2] / length)
+    return CArm(camera, (x, y, z), unit, _uncertainty(settings.get("uncertainty"), f"{where}.uncertainty"))
+
+
+def _uncertainty(settings: Any, where: str) -> Uncertainty:
+    """What a C-arm's file says of its intrinsics; None: nothing. Raises `InputError` that names `where` and the key."""
+    if settings is None:
+        return Uncertainty()
+    known = [f.name for f in fields(Uncertainty)]
+    if not isinstance(settings, dict) or (unknown := sorted(set(settings) - set(known))):
+        found = repr(settings) if not isinstance(settings, dict) else f"the key {unknown[0]!r}"
+        raise InputError(f"{where}: {{{', '.join(known)}}} was expected, found {found}.")
+    values = {key: _numbers(value, 1, f"{where}.{key}")[0] for key, value in settings.items()}
+    try:
+        return Uncertainty(**values)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
 
 
 def _numbers(value: Any, count: int, where: str) -> list[float]:

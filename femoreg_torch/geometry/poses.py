@@ -1,10 +1,12 @@
 """Where everything is: the C-arm of every view, and every object, all tied to camera 1."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from femoreg_torch.geometry.camera import Camera, CameraChange
 from femoreg_torch.geometry.rigid import invert_rigid
 
 
@@ -14,6 +16,11 @@ class Poses:
 
     camera_from_camera1: Tensor  # (V, 4, 4) float64, mm; the first is the identity
     camera1_from: dict[str, Tensor]  # (4, 4) float64 of every object placed so far, mm
+    changes: tuple[CameraChange, ...] = ()  # of every view's camera, where they were refined; none: as the C-arm says
+
+    def camera(self, view: int, camera: Camera) -> Camera:
+        """The camera of a view (from 0), given what the C-arm says of the same grid of pixels."""
+        return camera.changed(self.changes[view]) if self.changes else camera
 
     def camera_from(self, name: str) -> Tensor:
         """Poses (V, 4, 4) of an object in every view."""
@@ -29,16 +36,32 @@ class Poses:
         cameras[view] = camera_from_camera1
         return replace(self, camera_from_camera1=cameras)
 
+    def with_changes(self, changes: tuple[CameraChange, ...]) -> "Poses":
+        """The same with the camera of every view changed once more."""
+        before = self.changes or (CameraChange(),) * len(changes)
+        return replace(self, changes=tuple(old.then(new) for old, new in zip(before, changes, strict=True)))
+
+    def slid(self, motions: Tensor, names: Collection[str]) -> "Poses":
+        """The same with the named objects moved in the camera of each view by (V, 4, 4), which moves the C-arm too."""
+        first = motions[0]
+        return replace(
+            self,
+            camera_from_camera1=motions @ self.camera_from_camera1 @ invert_rigid(first),
+            camera1_from={n: first @ pose if n in names else pose for n, pose in self.camera1_from.items()},
+        )
+
     def seen_from(self, view: int) -> "Poses":
         """The same geometry with the camera of another view (from 0) as the common frame."""
         here = self.camera_from_camera1[view]
-        return Poses(
-            self.camera_from_camera1 @ invert_rigid(here), {n: here @ pose for n, pose in self.camera1_from.items()}
+        return replace(
+            self,
+            camera_from_camera1=self.camera_from_camera1 @ invert_rigid(here),
+            camera1_from={n: here @ pose for n, pose in self.camera1_from.items()},
         )
 
     def first_views(self, count: int) -> "Poses":
         """The same with the first so many views alone."""
-        return replace(self, camera_from_camera1=self.camera_from_camera1[:count])
+        return replace(self, camera_from_camera1=self.camera_from_camera1[:count], changes=self.changes[:count])
 
 
 def poses_by_object(camera_from_object: Tensor, name: str, camera1_from: dict[str, Tensor]) -> Poses:

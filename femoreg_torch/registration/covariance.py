@@ -4,18 +4,29 @@ The poses are where the scores of all image tiles cancel. Were the images drawn 
 by G = Σ s sᵀ, and the poses by H⁻¹ G H⁻¹ with the curvature H: the sandwich estimator with tiles as clusters (White,
 Maximum likelihood estimation of misspecified models, Econometrica 50 (1982) 1; Cameron and Miller, A practitioner's
 guide to cluster-robust inference, J. Human Resources 50 (2015) 317). It assumes neither a noise model nor independent
-pixels, only tiles that do not know of each other. What all tiles share (a wrong calibration, a wrong CT) it cannot see.
+pixels, only tiles that do not know of each other. What all tiles share (a wrong CT) it cannot see.
+
+The C-arm's intrinsics q are nuisance parameters with a prior of covariance 1 in their units. Refitted to other
+intrinsics, the poses would answer by J = −Hxx⁻¹ Hxq. What remains of the images with the poses refitted, S = Hqq +
+Hqx J with scores r = s_q + Jᵀ s_x, informs of q by S R⁻¹ S with R = Σ r rᵀ, the inverse of their own sandwich. With the
+prior this gives a mean m and a covariance P of q. The intrinsics q0 that the poses were found with are off by
+P + (m − q0)(m − q0)ᵀ in the mean square, and the covariance of the poses is Hxx⁻¹ G Hxx⁻¹ + J (P + …) Jᵀ. So
+intrinsics that were refined count with what the images leave open, and others also with how badly the images fit them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from femoreg_torch.geometry import Poses
+from femoreg_torch.geometry.rigid import skew
+from femoreg_torch.registration.imaging import PLAIN, Imaging
+from femoreg_torch.registration.intrinsics import Intrinsics, Profile, profile
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import PLAIN, Imaging, image_costs, stage_objective
-from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
+from femoreg_torch.registration.objective import image_costs, image_quadratic
+from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, reference_point_in_view
 from femoreg_torch.similarity import Similarity
 
 _UNIT_DEG, _UNIT_MM = 1.0, 1.0
@@ -25,7 +36,8 @@ _UNIT_DEG, _UNIT_MM = 1.0, 1.0
 class PoseCovariance:
     """Covariance (6 B, 6 B) of the motions of B bodies: of every object in camera 1, and of the C-arm of other views.
 
-    Where the C-arm's poses are known, of the objects alone.
+    Where the C-arm's poses are known, of the objects alone. It holds what is not known of the intrinsics; `images` is
+    the part of it without, as if the intrinsics were certain.
 
     A motion is a twist (degrees, mm) along the axes of its camera about the object's reference point, for a C-arm about
     that of the first object.
@@ -33,7 +45,10 @@ class PoseCovariance:
 
     bodies: tuple[str, ...]  # object names, then "view 2", …
     matrix: Tensor
-    step: Tensor  # (6 B,): where all images together would move the bodies, were all free; 0 at their common optimum
+    images: Tensor
+    centres: Tensor  # (B, 3) mm: what each body turns about, in its camera
+    intrinsics: "IntrinsicsEstimate"
+    step: Tensor  # (6 B,): where all images together would move the bodies, were all free with these intrinsics
 
     def of(self, first: str, second: str | None = None) -> Tensor:
         """The block (6, 6) of one body, or of two."""
@@ -45,10 +60,40 @@ class PoseCovariance:
         sigma = self.of(name).diagonal().sqrt().tolist()
         return sigma[:3], sigma[3:]
 
+    def by_images(self, name: str) -> tuple[list[float], list[float]]:
+        """As `deviations`, were the intrinsics certain."""
+        i = 6 * self.bodies.index(name)
+        sigma = self.images.diagonal()[i : i + 6].sqrt().tolist()
+        return sigma[:3], sigma[3:]
+
+    def relative_mm(self, name: str, other: str) -> list[float]:
+        """Standard deviations (3) along the axes of camera 1 of one object's reference point, seen from another object.
+
+        What moves both together, as a wrong source distance does, does not count.
+        """
+        i, j = (6 * self.bodies.index(each) for each in (name, other))
+        arm = self.centres[i // 6] - self.centres[j // 6]
+        response = self.matrix.new_zeros(3, len(self.matrix))
+        response[:, i + 3 : i + 6] = torch.eye(3)
+        response[:, j + 3 : j + 6] -= torch.eye(3)
+        response[:, j : j + 3] += skew(arm) * torch.pi / 180  # − ω × arm
+        return (response @ self.matrix @ response.T).diagonal().clamp(min=0).sqrt().tolist()
+
     def pull(self, name: str) -> tuple[float, float]:
         """Degrees and mm that all images together would move one body by, were all bodies free."""
         i = 6 * self.bodies.index(name)
         return float(self.step[i : i + 3].norm()), float(self.step[i + 3 : i + 6].norm())
+
+
+@dataclass(frozen=True, eq=False)
+class IntrinsicsEstimate:
+    """What prior and images say of the intrinsics, in standard deviations of the prior.
+
+    Log source distance, then x and y of the principal point of every view; zeros for what the C-arm's file holds.
+    """
+
+    mean: Tensor  # (1 + 2 V,), off from the C-arm's file
+    deviation: Tensor  # (1 + 2 V,)
 
 
 def pose_covariance(
@@ -61,10 +106,48 @@ def pose_covariance(
     found = views[1:] if scene.camera_from_camera1 is None else ()
     bodies = [Body((name,), 0, reference_point_in_view(scene, poses, name, 0), scale) for name in objects]
     bodies += [Body((), view, reference_point_in_view(scene, poses, objects[0], view), scale) for view in found]
-    images: list[tuple[Kind, int]] = [(kind, view) for kind in scene.images for view in views]
-    costs = image_costs(scene, poses, tuple(bodies), objects, images, level, similarity, imaging=imaging)
-    model = stage_objective(costs, tuple(bodies), None).quadratic(torch.zeros(6 * len(bodies), dtype=torch.float64))
-    inverse = torch.linalg.pinv(model.hessian, hermitian=True)
+    images = scene.there(scene.images, views)
+    refined = intrinsics_of(scene, poses, objects)
+    moving: tuple[Moving, ...] = (*bodies, refined)
+    costs = image_costs(scene, poses, moving, objects, images, level, similarity, imaging=imaging)
+    rigid = 6 * len(bodies)
+    model = image_quadratic(costs, torch.zeros(rigid + len(refined.free), dtype=torch.float64))
+    inverse = torch.linalg.pinv(model.hessian[:rigid, :rigid], hermitian=True)
     clusters = len(model.scores) / (len(model.scores) - 1)
-    matrix = clusters * inverse @ (model.scores.T @ model.scores) @ inverse
-    return PoseCovariance((*objects, *(f"view {view + 1}" for view in found)), matrix, -inverse @ model.gradient)
+    scores = model.scores[:, :rigid]
+    by_images = clusters * inverse @ (scores.T @ scores) @ inverse
+    of_intrinsics = profile(model, refined)
+    mean, spread = _estimate(of_intrinsics, clusters, refined)
+    response = of_intrinsics.answer + _slides(refined, poses, bodies)
+    off = mean - refined.units_off
+    matrix = by_images + response @ (spread + off[:, None] * off) @ response.T
+    estimate = IntrinsicsEstimate(torch.zeros_like(refined.scale), torch.zeros_like(refined.scale))
+    estimate.mean[refined.free] = mean
+    estimate.deviation[refined.free] = spread.diagonal().sqrt()
+    return PoseCovariance(
+        (*objects, *(f"view {view + 1}" for view in found)),
+        matrix,
+        by_images,
+        torch.stack([body.centre for body in bodies]),
+        estimate,
+        -inverse @ model.gradient[:rigid],
+    )
+
+
+def _estimate(images: Profile, clusters: float, refined: Intrinsics) -> tuple[Tensor, Tensor]:
+    """Mean (n,) and covariance (n, n) of the free intrinsics from the images and the prior, in units of the prior."""
+    weighed = images.curvature @ torch.linalg.pinv(clusters * images.scores.T @ images.scores, hermitian=True)  # S R⁻¹
+    information = weighed @ images.curvature
+    spread = torch.linalg.inv(torch.eye(len(weighed), dtype=torch.float64) + (information + information.T) / 2)
+    return spread @ (information @ refined.units_off - weighed @ images.scores.sum(0)), spread
+
+
+def _slides(refined: Intrinsics, poses: Poses, bodies: Sequence[Body]) -> Tensor:
+    """Motions (6 B, n) of the bodies, in degrees and mm, that come with the intrinsics: the C-arm slides."""
+    cameras = range(len(poses.camera_from_camera1))
+    ways = [refined.slide_rates(view).T @ refined.by_delta(view) for view in cameras]  # (3, n) mm in every camera
+    rows = ways[0].new_zeros(len(bodies), 6, ways[0].shape[1])
+    for row, body in zip(rows, bodies, strict=True):
+        turned = poses.camera_from_camera1[body.view, :3, :3] @ ways[0]
+        row[3:] = ways[body.view] - turned if body.view else ways[0]
+    return rows.flatten(0, 1)

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from torch import Tensor
+from torch.nn import functional as F
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import downsample
@@ -28,6 +29,10 @@ class Level:
     def image(self, image: Tensor, camera: Camera) -> Tensor:
         """An image (H, W) of the given camera, averaged to this level."""
         return downsample(image, binning(self.pixel_mm, camera))
+
+    def field(self, exposed: Tensor, camera: Camera) -> Tensor:
+        """The pixels of this level, bool, that lie wholly in a mask (H, W) of the given camera."""
+        return F.max_pool2d((~exposed)[None].float(), binning(self.pixel_mm, camera))[0] == 0
 
 
 def binning(pixel_mm: float, camera: Camera) -> int:

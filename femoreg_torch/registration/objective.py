@@ -1,47 +1,23 @@
 """The objective of a stage: mean similarity cost of a batch of candidate deltas (paper, equations 1, 3, 4)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from femoreg_torch.drr import project, project_with_jacobian
+from femoreg_torch.drr.moments import unit_rays
 from femoreg_torch.geometry import Camera, Poses, invert_rigid, transform_points
 from femoreg_torch.optimize import Quadratic, SmoothObjective
-from femoreg_torch.registration.level import Level, binning
-from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene, split
-from femoreg_torch.registration.weights import Weighting, pixel_weights
+from femoreg_torch.registration.imaging import PLAIN, Imaging, tissue_integrals
+from femoreg_torch.registration.intrinsics import PRIOR_WEIGHT, Intrinsics
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.scene import Body, Kind, Moving, RigidObject, Scene, split
+from femoreg_torch.registration.weights import Weighting, pixel_weights, prepared
 from femoreg_torch.similarity import FixedSimilarity, Similarity, similarity_quadratic
-from femoreg_torch.volume import Volume
 
 _STEP = 1e-5  # of a delta, for the derivatives of poses
-_TISSUE = Level(pixel_mm=3.1, step_mm=3.0)  # how finely the soft tissue is drawn; it is smooth
-
-
-@dataclass(frozen=True)
-class Imaging:
-    """How the images differ from plain line integrals of the objects.
-
-    `scatter` is the scattered light per primary light behind the patient but for what is drawn: it fills dark shadows,
-    so that −log flattens there, and their edges seem to lie farther out. `tissue` is the soft tissue's attenuation in
-    the images per attenuation in the CT (harder light); 0 draws none, nor does a scene without a CT.
-    """
-
-    scatter: float = 0.0
-    tissue: float = 0.0
-
-    def image(self, integrals: Tensor) -> Tensor:
-        """What is seen of line integrals."""
-        return -((-integrals).exp() + self.scatter).log() if self.scatter else integrals
-
-    def slope(self, integrals: Tensor) -> Tensor:
-        """Its derivative by them."""
-        return 1 / (1 + self.scatter * integrals.exp())
-
-
-PLAIN = Imaging()
 
 
 @dataclass(frozen=True)
@@ -78,7 +54,7 @@ class _Target:
 def _target(
     scene: Scene,
     poses: Poses,
-    bodies: Sequence[Body],
+    bodies: Sequence[Moving],
     render: Sequence[str],
     image: tuple[Kind, int],
     level: Level,
@@ -87,32 +63,24 @@ def _target(
     imaging: Imaging,
 ) -> _Target:
     kind, view = image
-    camera = level.camera(scene.carm.camera)
-    fixed = level.image(scene.images[kind][view], scene.carm.camera)
+    camera = poses.camera(view, level.camera(scene.carm.camera))
     drawn = scene.shown(render, kind)
-    moves = {name for body in bodies for name in (drawn if body.view == view and body.view else body.objects)}
+    rigid = [body for body in bodies if isinstance(body, Body)]
+    moves = {name for body in rigid for name in (drawn if body.view == view and body.view else body.objects)}
+    if len(rigid) < len(bodies):
+        moves = set(drawn)
     still = [name for name in drawn if name not in moves]
     background = torch.zeros(camera.shape)
     if still:
         where = torch.stack([poses.camera_from(name)[view] for name in still])[None]
         background = project([scene.objects[name].volume for name in still], where, camera, level.step_mm)[0]
-    placing = [name for body in bodies for name in body.objects]
+    placing = [name for body in rigid for name in body.objects]
     looked_at = pixel_weights(scene, poses, render, placing, image, camera, level.step_mm, weights)
-    prepared = similarity.against(fixed, looked_at)
+    fixed = prepared(scene, image, level, similarity, looked_at)
     tissue = None
     if imaging.tissue and scene.tissue is not None:
-        tissue = imaging.tissue * _tissue(scene.tissue, poses.camera_from(scene.anchor)[view], camera)
-    return _Target(view, camera, prepared, background, tuple(n for n in drawn if n in moves), tissue, imaging)
-
-
-def _tissue(tissue: Volume, camera_from_tissue: Tensor, camera: Camera) -> Tensor:
-    """Line integrals (H, W) of the soft tissue: on coarse pixels, and interpolated."""
-    factor = binning(_TISSUE.pixel_mm, camera)
-    rows, columns = (-(-n // factor) * factor for n in camera.shape)
-    wide = replace(camera, shape=(rows, columns)).downsampled(factor)
-    coarse = project([tissue], camera_from_tissue[None, None], wide, _TISSUE.step_mm)
-    fine = F.interpolate(coarse[None], size=(rows, columns), mode="bicubic", antialias=True)[0, 0]
-    return fine[: camera.shape[0], : camera.shape[1]].contiguous()
+        tissue = imaging.tissue * tissue_integrals(scene.tissue, poses.camera_from(scene.anchor)[view], camera)
+    return _Target(view, camera, fixed, background, tuple(n for n in drawn if n in moves), tissue, imaging)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,31 +89,52 @@ class ImageCosts:
 
     objects: dict[str, RigidObject]
     poses: Poses
-    bodies: tuple[Body, ...]
+    bodies: tuple[Moving, ...]
     step_mm: float
     targets: tuple[_Target, ...]
 
     def __call__(self, deltas: Tensor) -> Tensor:
         """Costs (P, images) of deltas (P, Σ n_b)."""
-        columns = []
-        for target in self.targets:
-            drawn = target.background.expand(len(deltas), *target.camera.shape)
-            if target.moving:
-                volumes = [self.objects[name].volume for name in target.moving]
-                drawn = drawn + project(volumes, self._placed(target, deltas), target.camera, self.step_mm)
-            columns.append(target.cost(drawn))
-        return torch.stack(columns, 1)
+        apart = deltas.split(1) if self._intrinsics(deltas) else [deltas]  # one camera draws a batch
+        return torch.cat([torch.stack([t.cost(self._drawn(t, part)) for t in self.targets], 1) for part in apart])
+
+    @property
+    def still(self) -> Tensor:
+        """The delta (Σ n_b,) that moves nothing."""
+        return torch.zeros(sum(len(body.free) for body in self.bodies), dtype=torch.float64)
 
     def quadratics(self, delta: Tensor) -> list[Quadratic]:
         """Each image's cost about one delta (Σ n_b,), with exact gradient and positive semi-definite curvature."""
         return [self._quadratic(target, delta) for target in self.targets]
 
+    def _drawn(self, target: _Target, deltas: Tensor) -> Tensor:
+        """Line integrals (P, H, W) of deltas that have the intrinsics of the first one."""
+        drawn = target.background.expand(len(deltas), *target.camera.shape)
+        if target.moving:
+            volumes = [self.objects[name].volume for name in target.moving]
+            camera = self._camera(target, deltas)
+            drawn = drawn + project(volumes, self._placed(target, deltas), camera, self.step_mm)
+        return drawn
+
+    def _intrinsics(self, deltas: Tensor) -> list[tuple[Intrinsics, Tensor]]:
+        """The intrinsics among the bodies, with their part of the deltas (P, n): one or none."""
+        parts = zip(self.bodies, split(deltas, self.bodies), strict=True)
+        return [(body, part) for body, part in parts if isinstance(body, Intrinsics)]
+
+    def _camera(self, target: _Target, deltas: Tensor) -> Camera:
+        """The camera at the first of the deltas."""
+        camera = target.camera
+        for intrinsics, part in self._intrinsics(deltas):
+            camera = camera.changed(intrinsics.changes(part[0])[target.view])
+        return camera
+
     def _placed(self, target: _Target, deltas: Tensor) -> Tensor:
         """Poses (P, O, 4, 4) of the target's moving objects."""
-        motions = [body.motion(part) for body, part in zip(self.bodies, split(deltas, self.bodies), strict=True)]
-        placed = [
-            _camera_from(name, target.view, self.poses, self.bodies, motions, len(deltas)) for name in target.moving
-        ]
+        parts = zip(self.bodies, split(deltas, self.bodies), strict=True)
+        motions = [(body, body.motion(part)) for body, part in parts if isinstance(body, Body)]
+        placed = [_camera_from(name, target.view, self.poses, motions, len(deltas)) for name in target.moving]
+        for intrinsics, part in self._intrinsics(deltas):
+            placed = [intrinsics.slides(part)[:, target.view] @ pose for pose in placed]
         return torch.stack(placed, 1)
 
     def _quadratic(self, target: _Target, delta: Tensor) -> Quadratic:
@@ -155,25 +144,49 @@ class ImageCosts:
             return Quadratic(cost, delta.new_zeros(1, n), delta.new_zeros(n, n))
         drawn, jacobians, twists = target.background, [], []
         placed = self._placed(target, delta[None])[0]  # (O, 4, 4)
+        camera = self._camera(target, delta[None])
+        refining = self._intrinsics(torch.eye(n, dtype=torch.float64))
+        by_rays = torch.zeros(*camera.shape, 3)  # derivatives by the intrinsics
         for name, pose, change in zip(target.moving, placed, self._changes(target, delta), strict=True):
             volume = self.objects[name].volume
             centre = transform_points(pose, self.objects[name].reference_point[None])[0]
-            image, jacobian = project_with_jacobian(volume, pose[None], target.camera, centre, self.step_mm)
+            image, jacobian = project_with_jacobian(
+                volume, pose[None], camera, centre, self.step_mm, intrinsics=bool(refining)
+            )
             drawn = drawn + image[0]
-            jacobians.append(jacobian[0])
+            jacobians.append(jacobian[0, ..., :6])
             twists.append(_twists(change, pose, centre))
-        # Six twists per object span all that the deltas do to this image.
+            for intrinsics, _ in refining:
+                across = _across(intrinsics.slide_rates(target.view, camera.sdd_mm), camera)
+                by_rays = by_rays + jacobian[0, ..., 6:] + (across @ jacobian[0, ..., 3:6, None])[..., 0]
+        for intrinsics, chosen in refining:
+            jacobians.append(by_rays)
+            twists.append(intrinsics.by_delta(target.view) @ chosen.T)
+        # Six twists per object, and three intrinsics of the view, span all that the deltas do to this image.
         changes = torch.cat(jacobians, -1) * target.imaging.slope(drawn)[..., None]
         cost, scores, hessian = similarity_quadratic(target.similarity, target.seen(drawn), changes)
-        by_delta = torch.cat(twists)  # (6 O, n)
+        by_delta = torch.cat(twists)  # (6 O, or 6 O + 3, n)
         return Quadratic(cost, scores @ by_delta, by_delta.T @ hessian @ by_delta)
 
     def _changes(self, target: _Target, delta: Tensor) -> Tensor:
-        """Derivatives (O, n, 4, 4) of the poses by the deltas, by central differences, good to some 1e-9."""
+        """Derivatives (O, n, 4, 4) of the poses by the bodies' motions, by central differences, good to some 1e-9."""
         steps = _STEP * torch.eye(len(delta), dtype=torch.float64)
+        for _, chosen in self._intrinsics(torch.eye(len(delta), dtype=torch.float64)):
+            steps = steps - _STEP * chosen @ chosen.T
         placed = self._placed(target, torch.cat([delta + steps, delta - steps]))  # (2 n, O, 4, 4)
         above, below = placed.chunk(2)
         return ((above - below) / (2 * _STEP)).movedim(0, 1)
+
+
+def _across(rates: Tensor, camera: Camera) -> Tensor:
+    """The parts (H, W, n, 3) of velocities (n, 3) in the camera frame that lie across each ray.
+
+    What moves along a ray does not change its integral. Sums over samples do change a little, and over the long way
+    that a slide goes this would drown the change of perspective.
+    """
+    rates = rates.to(torch.float32)
+    rays = unit_rays(camera)
+    return rates - (rays @ rates.T)[..., None] * rays[..., None, :]
 
 
 def _twists(changes: Tensor, pose: Tensor, centre: Tensor) -> Tensor:
@@ -187,7 +200,7 @@ def _twists(changes: Tensor, pose: Tensor, centre: Tensor) -> Tensor:
 def image_costs(
     scene: Scene,
     poses: Poses,
-    bodies: tuple[Body, ...],
+    bodies: tuple[Moving, ...],
     render: Sequence[str],
     images: Sequence[tuple[Kind, int]],
     level: Level,
@@ -206,13 +219,11 @@ def image_costs(
     return ImageCosts(scene.objects, poses, bodies, level.step_mm, targets)
 
 
-def _camera_from(
-    name: str, view: int, poses: Poses, bodies: tuple[Body, ...], motions: list[Tensor], candidates: int
-) -> Tensor:
+def _camera_from(name: str, view: int, poses: Poses, motions: Sequence[tuple[Body, Tensor]], candidates: int) -> Tensor:
     """Poses (P, 4, 4) of one object in one view for every candidate."""
     in_camera1 = poses.camera1_from[name].expand(candidates, 4, 4)
     camera = poses.camera_from_camera1[view].expand(candidates, 4, 4)
-    for body, motion in zip(bodies, motions, strict=True):
+    for body, motion in motions:
         if name in body.objects:
             in_camera1 = motion @ in_camera1
         if body.view and body.view == view:
@@ -220,27 +231,41 @@ def _camera_from(
     return camera @ in_camera1
 
 
-def stage_objective(costs: ImageCosts, bodies: tuple[Body, ...], prior: Prior | None) -> SmoothObjective:
-    """Mean cost over the images, plus the prior's penalty on how far each body moves."""
-    stiffness = torch.cat([_stiffness(body, prior) for body in bodies])  # (Σ n_b,): the penalty is ½ Σ k δ²
+def stage_objective(costs: ImageCosts, bodies: tuple[Moving, ...], prior: Prior | None) -> SmoothObjective:
+    """Mean cost over the images, plus the penalties on how far bodies move, and the cameras from the C-arm's file."""
+    stiffness = torch.cat([_stiffness(body, prior) for body in bodies])  # (Σ n_b,)
+    # The penalty is ½ Σ k (δ + offset)².
+    offset = torch.cat([b.units_off if isinstance(b, Intrinsics) else b.scale.new_zeros(len(b.free)) for b in bodies])
 
     def values(deltas: Tensor) -> Tensor:
-        return costs(deltas).mean(1) + 0.5 * (deltas.square() @ stiffness)
+        return costs(deltas).mean(1) + 0.5 * ((deltas + offset).square() @ stiffness)
 
     def quadratic(delta: Tensor) -> Quadratic:
-        parts = costs.quadratics(delta)
-        penalty = float(0.5 * (delta.square() @ stiffness))
+        model = image_quadratic(costs, delta)
+        away = delta + offset
         return Quadratic(
-            sum(part.value for part in parts) / len(parts) + penalty,
-            torch.cat([*(part.scores / len(parts) for part in parts), (stiffness * delta)[None]]),
-            torch.stack([part.hessian for part in parts]).mean(0) + stiffness.diag(),
+            model.value + float(0.5 * (away.square() @ stiffness)),
+            torch.cat([model.scores, (stiffness * away)[None]]),
+            model.hessian + stiffness.diag(),
         )
 
     return SmoothObjective(values, quadratic)
 
 
-def _stiffness(body: Body, prior: Prior | None) -> Tensor:
-    """Second derivatives (n,) of the prior's penalty by the body's deltas."""
+def image_quadratic(costs: ImageCosts, delta: Tensor) -> Quadratic:
+    """Mean cost over the images about one delta (Σ n_b,), without penalties."""
+    parts = costs.quadratics(delta)
+    return Quadratic(
+        sum(part.value for part in parts) / len(parts),
+        torch.cat([part.scores / len(parts) for part in parts]),
+        torch.stack([part.hessian for part in parts]).mean(0),
+    )
+
+
+def _stiffness(body: Moving, prior: Prior | None) -> Tensor:
+    """Second derivatives (n,) of the penalty by the body's deltas."""
+    if isinstance(body, Intrinsics):
+        return torch.full((len(body.free),), PRIOR_WEIGHT, dtype=torch.float64)
     if prior is None:
         return torch.zeros(len(body.free), dtype=torch.float64)
     sigma = body.scale.new_tensor([prior.rotation_deg * torch.pi / 180] * 3 + [prior.translation_mm] * 3)

@@ -16,11 +16,12 @@ from femoreg_torch.registration.scene import Kind, Scene
 from femoreg_torch.registration.step import (
     CARM_IS_KNOWN,
     ONE_VIEW,
-    check_placed,
+    check_known,
     chosen_kinds,
     chosen_objects,
     lacking,
 )
+from femoreg_torch.registration.weights import prepared
 from femoreg_torch.similarity import Similarity
 
 
@@ -28,7 +29,8 @@ from femoreg_torch.similarity import Similarity
 class OrbitSearch:
     """Exhaustive search of every other view along the C-arm's orbit, from the first view.
 
-    Costs are the mean over the images of the given kinds; [all] in `kinds` or `render` stands for all.
+    Costs are the mean over those images of the given kinds that a view has. [all] in `kinds` or `render` stands for
+    all.
     """
 
     name: str
@@ -45,10 +47,20 @@ class OrbitSearch:
             return ONE_VIEW
         if scene.camera_from_camera1 is not None:
             return CARM_IS_KNOWN
-        if reason := lacking(chosen_kinds(self.kinds, scene), scene):
-            raise InputError(f"it finds the C-arm of the other views, but {reason}. Choose another preset.")
-        check_placed(chosen_objects(self.render, poses), poses)
+        kinds = chosen_kinds(self.kinds, scene)
+        check_known(self.render, kinds, scene, poses)
+        for view in range(1, scene.views):
+            if not self.images(scene, poses, view):
+                reason = lacking(kinds, (view,), scene) or f"the images of view {view + 1} show nothing that it draws"
+                raise InputError(f"it finds the C-arm of the other views, but {reason}. Choose another preset.")
         return None
+
+    def images(self, scene: Scene, poses: Poses, view: int) -> list[tuple[Kind, int]]:
+        """The images, (kind, view) pairs, of a view (from 0) that show something of what it draws."""
+        drawn = chosen_objects(self.render, poses)
+        return [
+            image for image in scene.there(chosen_kinds(self.kinds, scene), (view,)) if scene.shown(drawn, image[0])
+        ]
 
     def run(self, scene: Scene, poses: Poses, seed: int) -> Iterator[StageRecord]:
         """One search for every other view, see `Step`; nothing is random."""
@@ -62,7 +74,7 @@ def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> 
     """Place the C-arm of one view (from 0) at the angle of its orbit, from view 1, that fits its images best."""
     began = time.perf_counter()
     orbit = scene.carm.orbit(orbit_angles(search.half_range_deg, search.step_deg))  # (N, 4, 4)
-    costs = [_costs(scene, poses, search, kind, view, orbit) for kind in chosen_kinds(search.kinds, scene)]
+    costs = [_costs(scene, poses, search, kind, view, orbit) for kind, _ in search.images(scene, poses, view)]
     values = torch.stack(costs).mean(0)  # (N,)
     best = int(values.argmin())
     seconds = time.perf_counter() - began
@@ -81,7 +93,6 @@ def _costs(scene: Scene, poses: Poses, search: OrbitSearch, kind: Kind, view: in
     """Costs (N,) of one image with the C-arm at the poses `orbit` (N, 4, 4)."""
     names = scene.shown(chosen_objects(search.render, poses), kind)
     where = torch.stack([orbit @ poses.camera1_from[name] for name in names], 1)  # (N, O, 4, 4)
-    camera = search.level.camera(scene.carm.camera)
+    camera = poses.camera(view, search.level.camera(scene.carm.camera))
     drawn = project([scene.objects[name].volume for name in names], where, camera, search.level.step_mm)
-    fixed = search.level.image(scene.images[kind][view], scene.carm.camera)
-    return search.similarity.against(fixed, None)(drawn)
+    return prepared(scene, (kind, view), search.level, search.similarity)(drawn)

@@ -7,14 +7,15 @@ from typing import Any, get_type_hints
 from femoreg_torch.configs import load_preset
 from femoreg_torch.extensions import find, pop_kind, record_of
 from femoreg_torch.optimize import Optimiser, read_optimiser
-from femoreg_torch.registration.objective import PLAIN, Imaging
+from femoreg_torch.registration.calibration import Calibration
+from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.orbit import OrbitSearch
 from femoreg_torch.registration.stage import Stage
 from femoreg_torch.registration.step import Step
 from femoreg_torch.settings import read_record
 from femoreg_torch.similarity import Similarity, read_similarity
 
-STEPS = {"stage": Stage, "orbit_search": OrbitSearch}
+STEPS = {"stage": Stage, "orbit_search": OrbitSearch, "calibration": Calibration}
 _READERS = {Similarity: read_similarity, Optimiser: read_optimiser}  # of fields that say their `kind`
 
 

@@ -1,14 +1,26 @@
 """From a case on disk to the scene that is registered."""
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import Anatomy
-from femoreg_torch.case import Case, CaseObject, Model, View
+from femoreg_torch.case import Case, CaseObject
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import attenuation_image, check_matches, read_image
+from femoreg_torch.fluoro import (
+    Circle,
+    Polygon,
+    attenuation_image,
+    check_matches,
+    find_shutter,
+    read_image,
+    without_penumbra,
+)
+from femoreg_torch.registration.models import model_attenuation
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.registration.silhouette import outline_of
 from femoreg_torch.volume import (
@@ -18,27 +30,23 @@ from femoreg_torch.volume import (
     check_inside,
     hu_to_attenuation,
     label_box_centre,
-    labelled_device,
     read_ct,
     read_labels,
-    read_mesh,
     resample_isotropic,
-    scanned_device,
     structure_attenuation,
-    voxelise_mesh,
 )
 
 REGISTRATION_SPACING_MM = 1.0  # the paper resamples the CT to 1 mm (section III-A)
 TISSUE_SPACING_MM = 3.0  # soft tissue is smooth
 SOFT_HU = 50.0  # what is above is drawn as bone
-MODEL_SPACING_MM = 0.5  # a sleeve's wall is thinner than a CT voxel
+ByKind = dict[Kind, tuple[Tensor | None, ...]]  # something (H, W) of every view
 
 
 def prepare_scene(case: Case) -> Scene:
     """Volumes, reference points and images of a case. Raises `InputError` for every input that does not fit."""
     if not case.views:
         raise InputError(f"{case.folder}/case.yaml, views: empty. At least one fluoroscopic image is needed.")
-    images, missing = read_images(case)
+    images, fields, told = read_images(case)
     from_ct = [thing for thing in case.objects.values() if thing.model is None]
     objects: dict[str, RigidObject] = {}
     tissue = outline = None
@@ -51,9 +59,15 @@ def prepare_scene(case: Case) -> Scene:
         outline = outline_of(bones, case.anatomy)
     for thing in case.objects.values():
         if thing.model is not None:
-            volume = model_attenuation(thing.model)
-            centre = volume.centre() if thing.reference is None else thing.reference
-            objects[thing.name] = RigidObject(volume, centre, thing.images or tuple(images), thing.start)
+            made = model_attenuation(thing.model)
+            objects[thing.name] = RigidObject(
+                made.volume,
+                made.volume.centre() if thing.reference is None else thing.reference,
+                thing.images or tuple(images),
+                thing.start,
+                parts=made.parts,
+                materials_known=thing.model.materials_known,
+            )
     known = case.views[-1].camera_from_camera1 is not None
     identity = torch.eye(4, dtype=torch.float64)
     cameras = [identity if v.camera_from_camera1 is None else v.camera_from_camera1 for v in case.views]
@@ -61,10 +75,11 @@ def prepare_scene(case: Case) -> Scene:
         case.carm,
         {name: objects[name] for name in case.objects},
         images,
+        fields=fields,
         tissue=tissue,
         outline=outline,
         camera_from_camera1=torch.stack(cameras) if known else None,
-        missing=missing,
+        missing=told,
     )
 
 
@@ -110,47 +125,101 @@ def reference_point(case: Case, name: str, bones: BoneLabels | None) -> Tensor:
     if thing.reference is not None:
         return thing.reference
     if thing.model is not None:
-        return model_attenuation(thing.model).centre()
+        return model_attenuation(thing.model).volume.centre()
     if bones is None:
         raise InputError(f"{case.folder}: has no label map to find the middle of {name}. Add `ct.labels`.")
     return label_box_centre(bones.labels, bones.of(thing.bones, case.anatomy))
 
 
-def model_attenuation(model: Model) -> Volume:
-    """Attenuation (1/mm) of a model in its own space. Raises `InputError` for a mesh or volume that does not fit."""
-    if model.hu is None:
-        return scanned_device(model.path)
-    if model.labels is not None:
-        return labelled_device(model.path, model.labels, model.hu, MODEL_SPACING_MM)
-    return voxelise_mesh(read_mesh(model.path), MODEL_SPACING_MM, model.hu)
+def read_images(case: Case) -> tuple[ByKind, ByKind, tuple[str, ...]]:
+    """Attenuation images (H, W) of all views by kind, None where a view lacks one, and their exposed fields, bool.
 
-
-def read_images(case: Case) -> tuple[dict[Kind, tuple[Tensor, ...]], tuple[str, ...]]:
-    """Attenuation images (H, W) of all views by kind, and in words which kinds are left out.
-
-    A kind is taken only if every view has an image of it. Raises `InputError` if a view lacks one of the first kind.
+    A field is None where the whole detector is exposed. Last, in words, which images are missing, and which shutters
+    were found. Raises `InputError` if a view lacks an image of the first kind.
     """
-    images: dict[Kind, tuple[Tensor, ...]] = {}
-    missing = []
+    images: ByKind = {}
+    fields: ByKind = {}
+    told = []
     wanted = dict.fromkeys((*case.kinds, *(kind for thing in case.objects.values() for kind in thing.images or ())))
     for kind in wanted:
         without = [number for number, view in enumerate(case.views, 1) if kind not in view.images]
-        if not without:
-            images[kind] = tuple(_attenuation(case, i, view, kind) for i, view in enumerate(case.views))
-        elif kind == case.kinds[0]:
+        if without and kind == case.kinds[0]:
             raise InputError(f"{case.folder}/case.yaml, views[{without[0] - 1}].{kind}: missing.")
-        elif len(without) == len(case.views):
-            missing.append(f"there are no {kind} images")
-        else:
-            views = ", ".join(map(str, without))
-            missing.append(
-                f"view {views} has no {kind} image, so the {kind} images of the other views were left out too"
+        if len(without) < len(case.views):
+            read = [_read_image(case, i, kind) if kind in view.images else None for i, view in enumerate(case.views)]
+            images[kind] = tuple(None if one is None else one.attenuation for one in read)
+            fields[kind] = tuple(None if one is None else one.field for one in read)
+            told += [one.told for one in read if one is not None and one.told is not None]
+        if without:
+            told.append(_told(case, kind, without))
+    _check_different(case, images)
+    return images, fields, tuple(told)
+
+
+def _check_different(case: Case, images: ByKind) -> None:
+    """Raises `InputError` if one image is given twice: two exposures are never the same in every pixel."""
+    there = [(kind, view, one) for kind, of in images.items() for view, one in enumerate(of) if one is not None]
+    for (kind, view, one), (other_kind, other_view, other) in itertools.combinations(there, 2):
+        if torch.equal(one, other):
+            raise InputError(
+                f"{case.folder}/case.yaml, views[{other_view}].{other_kind}: the same image as views[{view}].{kind}. "
+                "Give every exposure its own image."
             )
-    return images, tuple(missing)
 
 
-def _attenuation(case: Case, index: int, view: View, kind: Kind) -> Tensor:
-    path = view.images[kind]
-    image = read_image(path)
-    check_matches(image, case.carm.camera, f"{case.folder}/case.yaml, views[{index}].{kind}")
-    return attenuation_image(image) if view.intensity == "raw" else image
+def _told(case: Case, kind: Kind, without: list[int]) -> str:
+    """What it means that some views (from 1) have no image of a kind."""
+    has = [number for number in range(1, len(case.views) + 1) if number not in without]
+    if not has:
+        nowhere = [
+            name for name, thing in case.objects.items() if thing.images and not set(thing.images) & set(case.kinds)
+        ]
+        return f"there are no {kind} images" + (f", so nothing shows the {_listed(nowhere)}" if nowhere else "")
+    only = [name for name, thing in case.objects.items() if thing.images is not None and set(thing.images) == {kind}]
+    told = f"{_views(without)} {'has' if len(without) == 1 else 'have'} no {kind} image"
+    return told + (f": the {_listed(only)} was found in {_views(has)}" if only else "")
+
+
+def _views(numbers: Sequence[int]) -> str:
+    return f"view{'s' * (len(numbers) > 1)} {_listed(numbers)}"
+
+
+def _listed(words: Sequence[object]) -> str:
+    *most, last = map(str, words)
+    return f"{', '.join(most)} and {last}" if most else last
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    attenuation: Tensor  # (H, W)
+    field: Tensor | None  # (H, W) bool: what is exposed; None: all
+    told: str | None  # of a shutter that was found, in words
+
+
+def _read_image(case: Case, index: int, kind: Kind) -> _Image:
+    """One image of a view (from 0) and its field: what the case tells, or else what a shutter leaves of it."""
+    view, camera = case.views[index], case.carm.camera
+    image = read_image(view.images[kind])
+    check_matches(image, camera, f"{case.folder}/case.yaml, views[{index}].{kind}")
+    raw = image if view.intensity == "raw" else (-image).exp()
+    field, told = None, None
+    if view.field is not None:
+        field = without_penumbra(_told_field(case, index, view.field), camera)
+        if not field.any():
+            raise InputError(f"{case.folder}/case.yaml, views[{index}].field: exposes no pixel of the image.")
+    elif (shutter := find_shutter(raw, camera)) is not None:
+        field = shutter.field
+        told = (
+            f"view {index + 1}, {kind} image: a {shutter.shape} shutter was found, "
+            f"{100 * shutter.exposed:.0f} % of the detector is exposed"
+        )
+    return _Image(attenuation_image(image, field) if view.intensity == "raw" else image, field, told)
+
+
+def _told_field(case: Case, index: int, field: Circle | Polygon | Path) -> Tensor:
+    """The exposed pixels (H, W) that a view (from 0) tells."""
+    if not isinstance(field, Path):
+        return field.exposed(case.carm.camera.shape)
+    mask = read_image(field)
+    check_matches(mask, case.carm.camera, f"{case.folder}/case.yaml, views[{index}].field")
+    return mask > 0

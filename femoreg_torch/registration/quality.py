@@ -5,20 +5,24 @@ that is not where it is drawn explains little of the image. Second, where each v
 object in its own image plane: views that pull in different directions contradict each other, or their common geometry.
 Third, where all views together would move it, were everything free: what a stage held in a wrong place, the C-arm, say,
 moves then. Fourth, the standard deviations of the pose (`registration.covariance`), depth included. Fifth, how far it
-lies from where it was expected. Sixth, whether other starts of a stage ended elsewhere and fitted as well.
+lies from where it was expected. Sixth, whether other starts of a stage ended elsewhere and fitted as well. Seventh,
+how far what is not known of the C-arm's source distance and principal points leaves it open beside the other objects;
+and of the C-arm itself, whether the images fit other intrinsics than its file says.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
-from femoreg_torch.case.quality import ObjectQuality, ViewQuality
+from femoreg_torch.case.quality import CameraQuality, ObjectQuality, ViewQuality
 from femoreg_torch.case.trace import StageRecord
-from femoreg_torch.geometry import Poses, pose_difference
+from femoreg_torch.geometry import CArm, Poses, pose_difference
 from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
+from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import PLAIN, Imaging, image_costs
+from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 
@@ -37,6 +41,7 @@ class Limits:
     most_common_pull_deg: float = 0.6
     most_deviation_mm: float = 1.0  # standard deviation along any axis
     most_deviation_deg: float = 0.6  # and about any axis
+    most_intrinsics_sigma: float = 3.0  # of the C-arm's file, between what it says and what the images fit
     rival_cost: float = 0.005  # another start of a stage that ended so little above the best,
     rival_deg: float = 15.0  # but so far away
     rival_mm: float = 50.0  # or so far, is a rival; what is nearer, the following stages tell apart
@@ -46,14 +51,47 @@ class Limits:
 
 
 def assess(
-    scene: Scene, poses: Poses, limits: Limits, imaging: Imaging = PLAIN, trace: Sequence[StageRecord] = ()
+    scene: Scene,
+    poses: Poses,
+    limits: Limits,
+    imaging: Imaging = PLAIN,
+    trace: Sequence[StageRecord] = (),
+    covariance: PoseCovariance | None = None,
 ) -> dict[str, ObjectQuality]:
-    """Quality of every object placed in `poses`, in the first kind of images that shows it, drawn with `imaging`.
+    """Quality of every object placed in `poses`, drawn with `imaging`: in every view the first kind that shows it.
 
-    `trace` is that of the steps which led there.
+    A view that has no image which shows an object says nothing about it.
+
+    `trace` is that of the steps which led there, `covariance` that of `final_covariance`, if it is known already.
     """
-    covariance = pose_covariance(scene, poses, _LEVEL, _SIMILARITY, imaging)
+    covariance = covariance or final_covariance(scene, poses, imaging)
     return {name: _assess_object(scene, poses, name, covariance, limits, imaging, trace) for name in poses.camera1_from}
+
+
+def final_covariance(scene: Scene, poses: Poses, imaging: Imaging = PLAIN) -> PoseCovariance:
+    """The covariance of a solution that its quality is told by."""
+    return pose_covariance(scene, poses, _LEVEL, _SIMILARITY, imaging)
+
+
+def assess_cameras(scene: Scene, poses: Poses, covariance: PoseCovariance) -> tuple[CameraQuality, ...]:
+    """The camera of every view, and how well it is known."""
+    deviation = covariance.intrinsics.deviation
+    cameras = (scene.camera(poses, view) for view in range(len(poses.camera_from_camera1)))
+    return tuple(
+        CameraQuality(
+            camera.sdd_mm,
+            camera.principal_point_px,
+            float(deviation[0]) * scene.carm.uncertainty.sdd_percent / 100 * camera.sdd_mm,
+            shift_px(scene.carm, deviation[1 + 2 * view : 3 + 2 * view]),
+        )
+        for view, camera in enumerate(cameras)
+    )
+
+
+def shift_px(carm: CArm, deviations: Tensor) -> tuple[float, float]:
+    """A shift (2,) of the principal point in units of the C-arm's uncertainty, as columns and rows."""
+    x, y = (deviations * carm.uncertainty.principal_point_mm).tolist()
+    return x / carm.camera.pixel_mm[1], y / carm.camera.pixel_mm[0]
 
 
 def _assess_object(
@@ -65,8 +103,8 @@ def _assess_object(
     imaging: Imaging,
     trace: Sequence[StageRecord],
 ) -> ObjectQuality:
-    kind = next(kind for kind in scene.objects[name].shown_in if kind in scene.images)
-    views = tuple(_assess_view(scene, poses, name, (kind, view), imaging) for view in range(len(scene.images[kind])))
+    seen = (scene.there(scene.objects[name].shown_in, (view,)) for view in range(scene.views))
+    views = tuple(_assess_view(scene, poses, name, images[0], imaging) for images in seen if images)
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
     rotation, translation = covariance.deviations(name)
@@ -75,11 +113,12 @@ def _assess_object(
     reason = (
         _reason(name, views, limits)
         or _unsettled(name, pull, limits)
-        or _vague(name, rotation, translation, limits)
+        or _vague(name, *covariance.by_images(name), limits)
+        or _loose(name, scene.anchor, covariance, limits)
         or _displaced(scene, name, displacement, limits)
         or _rivalled(name, trace, limits)
     )
-    told = reason or "all views agree"
+    told = reason or ("all views agree" if len(views) == scene.views else "all views that show it agree")
     return ObjectQuality(
         views, uncertainty, pull, tuple(rotation), tuple(translation), displacement, reason is None, told
     )
@@ -118,6 +157,19 @@ def _vague(name: str, rotation: Sequence[float], translation: Sequence[float], l
     if not max(rotation) <= limits.most_deviation_deg:
         return f"the images fix the {name} to {max(rotation):.1f}° only (standard deviation about one axis)"
     return None
+
+
+def _loose(name: str, anchor: str, covariance: PoseCovariance, limits: Limits) -> str | None:
+    """What not knowing the C-arm leaves open between two objects; nan counts as open."""
+    if anchor not in covariance.bodies:
+        return None
+    deviation = max(covariance.relative_mm(name, anchor))
+    if deviation <= limits.most_deviation_mm:
+        return None
+    return (
+        f"the C-arm's source distance and principal points are not known well enough: they leave the {name} open by "
+        f"{deviation:.1f} mm beside the {anchor} (standard deviation along one axis)"
+    )
 
 
 def _reason(name: str, views: Sequence[ViewQuality], limits: Limits) -> str | None:

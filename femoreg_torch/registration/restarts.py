@@ -8,18 +8,19 @@ from torch import Tensor
 from femoreg_torch.case.trace import Restart
 from femoreg_torch.geometry import Poses, pose_difference
 from femoreg_torch.optimize import Result
-from femoreg_torch.registration.scene import Body, Scene
+from femoreg_torch.registration.scene import Body, Moving, Scene
 
 
 def restarts_of(
-    result: Result, scene: Scene, bodies: Sequence[Body], poses_after: Callable[[Tensor], Poses]
+    result: Result, scene: Scene, bodies: Sequence[Moving], poses_after: Callable[[Tensor], Poses]
 ) -> tuple[Restart, ...]:
     """The ends of all starts but the best, the best of them first; none of an optimiser that has one start."""
     ends = sorted(result.ends)
     places = [poses_after(torch.tensor(delta, dtype=torch.float64)) for _, delta in ends]
     found = []
     for (cost, _), place in zip(ends[1:], places[1:], strict=True):
-        apart = [_apart(scene, body, places[0], place) for body in bodies]
+        rigid = [body for body in bodies if isinstance(body, Body)]
+        apart = [_apart(scene, body, places[0], place) for body in rigid] or [(0.0, 0.0)]
         found.append(Restart(cost - ends[0][0], max(deg for deg, _ in apart), max(mm for _, mm in apart)))
     return tuple(found)
 

@@ -16,11 +16,18 @@ from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.detect import detect, load_network
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import check_rigid
+from femoreg_torch.registration.doubts import doubts
 from femoreg_torch.registration.plan import Plan, load_plan
 from femoreg_torch.registration.prepare import prepare_scene
-from femoreg_torch.registration.quality import Limits, assess
+from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance
 from femoreg_torch.registration.scene import Scene
-from femoreg_torch.registration.start import Detector, start_by_detection, start_by_landmarks, with_segmentations
+from femoreg_torch.registration.start import (
+    Detector,
+    look_at,
+    start_by_detection,
+    start_by_landmarks,
+    with_segmentations,
+)
 from femoreg_torch.registration.workflow import Report, run_plan
 
 
@@ -97,12 +104,16 @@ def register_scene(
     anchor = began.camera1_from_object if scene.needs_landmarks else None
     outcome = run_plan(scene, plan, anchor, seed, report)
     clock["registered"] = time.perf_counter()
-    quality = assess(scene, outcome.poses, Limits(), plan.imaging, outcome.trace)
+    scene = outcome.scene
+    covariance = final_covariance(scene, outcome.poses, plan.imaging)
+    quality = assess(scene, outcome.poses, Limits(), plan.imaging, outcome.trace, covariance)
     done = time.perf_counter()
     points, directions = path_in_camera1(case, outcome.poses)
     result = Result(
         poses=outcome.poses,
         quality=quality,
+        cameras=assess_cameras(scene, outcome.poses, covariance) if outcome.poses.changes else (),
+        doubts=doubts(case, scene, outcome.poses, covariance, Limits()),
         start=began,
         stages=tuple(outcome.trace),
         skipped=(*scene.missing, *outcome.skipped, *_unchecked(case, scene, began)),
@@ -165,7 +176,7 @@ def _start(
             )
         report("finding landmarks", 0.0)
         look = find or network_detector(case)
-        seen = look(scene.images[scene.first_kind][0], scene.carm.camera)
+        seen = look_at(scene, 0, look)
     if not scene.needs_landmarks:
         began = StartRecord(scene.anchor, scene.start().camera1_from[scene.anchor], "poses that were given")
     elif landmarks is not None:

@@ -1,16 +1,28 @@
 """What is registered: volumes of the rigid objects, the fluoroscopic images, and where everything starts."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+import torch
 from torch import Tensor
 
 from femoreg_torch.case import Start
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import Camera, CArm, Poses, about_point, exp_se3, first_view_only, transform_points
+from femoreg_torch.geometry import (
+    Camera,
+    CameraChange,
+    CArm,
+    Poses,
+    about_point,
+    exp_se3,
+    first_view_only,
+    transform_points,
+)
+from femoreg_torch.registration.intrinsics import Intrinsics
 from femoreg_torch.volume import Volume
 
-Kind = str  # of images: all views have one of each kind; those without and those with the device, say
+Kind = str  # of images: those without and those with the device, say
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +34,8 @@ class RigidObject:
     shown_in: tuple[Kind, ...]  # the kinds of images that hold it
     start: Start = field(default_factory=Start)  # where the landmarks put it, if nothing else is said
     classes: tuple[int, ...] = ()  # of the segmentation that show it; none for what the network does not know
+    parts: tuple[Volume, ...] = ()  # of a model, each of one material; on the grid of `volume`, which is their sum
+    materials_known: bool = False  # whether materials were named; the HU of a single solid may be a guess
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +60,16 @@ class Scene:
 
     carm: CArm
     objects: dict[str, RigidObject]
-    images: dict[
-        Kind, tuple[Tensor, ...]
-    ]  # attenuation images (H, W), one per view; landmarks are seen in the first kind
+    # attenuation images (H, W), one per view or None where it lacks one; landmarks are seen in the first kind, which
+    # every view has
+    images: dict[Kind, tuple[Tensor | None, ...]]
+    # pixels (H, W), bool, that no shutter shades, one mask per view; None, or no entry, where all are exposed
+    fields: dict[Kind, tuple[Tensor | None, ...]] = field(default_factory=dict)
     segmentations: tuple[Segmentation, ...] = ()  # one per view; none unless a stage weighs its pixels by them
     tissue: Volume | None = None  # attenuation of the soft tissue, 1/mm, in the space of `anchor`
     outline: Outline | None = None  # what checks the start, in the space of `anchor`
     camera_from_camera1: Tensor | None = None  # (V, 4, 4) where the C-arm's poses are known and stay; None: to be found
-    missing: tuple[str, ...] = ()  # what the case lacks, in words
+    missing: tuple[str, ...] = ()  # what the case lacks and what shutters hide, in words
 
     @property
     def first_kind(self) -> Kind:
@@ -64,6 +80,23 @@ class Scene:
     def views(self) -> int:
         """The number of C-arm poses."""
         return len(self.images[self.first_kind])
+
+    def image(self, kind: Kind, view: int) -> Tensor:
+        """The image (H, W) of a kind in a view (from 0). Raises `InputError` where there is none."""
+        image = self.images[kind][view] if kind in self.images else None
+        if image is None:
+            raise InputError(f"view {view + 1} has no {kind} image.")
+        return image
+
+    def field(self, kind: Kind, view: int) -> Tensor | None:
+        """The exposed pixels (H, W), bool, of the image of a kind in a view (from 0); None where all are."""
+        return self.fields[kind][view] if kind in self.fields else None
+
+    def there(self, kinds: Iterable[Kind], views: Iterable[int]) -> list[tuple[Kind, int]]:
+        """Those images, (kind, view) pairs, of some kinds and views (from 0) that the scene has."""
+        of = [kind for kind in kinds if kind in self.images]
+        views = tuple(views)
+        return [(kind, view) for kind in of for view in views if self.images[kind][view] is not None]
 
     @property
     def anchor(self) -> str:
@@ -76,6 +109,10 @@ class Scene:
         """Whether an object starts where landmarks put it."""
         return any(thing.start.by_landmarks for thing in self.objects.values())
 
+    def camera(self, poses: Poses, view: int) -> Camera:
+        """The camera of the images of a view (from 0), as refined as the poses."""
+        return poses.camera(view, self.carm.camera)
+
     def shown(self, names: Iterable[str], kind: Kind) -> list[str]:
         """Those of the named objects that images of a kind hold."""
         return [name for name in names if kind in self.objects[name].shown_in]
@@ -86,7 +123,7 @@ class Scene:
         Raises `InputError` for an object that starts from landmarks if none are given, or beside one without a place.
         """
         placed: dict[str, Tensor] = {}
-        waiting = [name for name, thing in self.objects.items() if any(kind in self.images for kind in thing.shown_in)]
+        waiting = [name for name, thing in self.objects.items() if self.there(thing.shown_in, range(self.views))]
         while waiting:
             left = []
             for name in waiting:
@@ -149,17 +186,42 @@ def reference_point_in_view(scene: Scene, poses: Poses, name: str, view: int) ->
     return transform_points(poses.camera_from(name)[view], scene.objects[name].reference_point[None])[0]
 
 
-def split(deltas: Tensor, bodies: tuple[Body, ...]) -> list[Tensor]:
+Moving = Body | Intrinsics
+
+
+def split(deltas: Tensor, bodies: tuple[Moving, ...]) -> list[Tensor]:
     """The part (P, n_b) of deltas (P, Σ n_b) that belongs to each body."""
     return list(deltas.split([len(body.free) for body in bodies], -1))
 
 
-def moved(poses: Poses, bodies: tuple[Body, ...], delta: Tensor) -> Poses:
+def moved(poses: Poses, bodies: tuple[Moving, ...], delta: Tensor) -> Poses:
     """Poses after one delta (Σ n_b,) of the bodies."""
     for body, part in zip(bodies, split(delta[None], bodies), strict=True):
+        if isinstance(body, Intrinsics):
+            continue
         motion = body.motion(part)[0]
         if body.view:
             poses = poses.with_view(body.view, motion @ poses.camera_from_camera1[body.view])
         for name in body.objects:
             poses = poses.with_object(name, motion @ poses.camera1_from[name])
+    for body, part in zip(bodies, split(delta[None], bodies), strict=True):
+        if isinstance(body, Intrinsics):  # after all else has moved
+            poses = poses.slid(body.slides(part)[0], body.objects).with_changes(body.changes(part[0]))
     return poses
+
+
+def intrinsics_of(scene: Scene, poses: Poses, objects: Sequence[str]) -> Intrinsics:
+    """The intrinsics of all views, free as far as the C-arm's file is uncertain, about the anchor's reference point.
+
+    `objects` are those drawn.
+    """
+    uncertainty, views = scene.carm.uncertainty, len(poses.camera_from_camera1)
+    scale = [uncertainty.sdd_percent / 100] + 2 * views * [uncertainty.principal_point_mm]
+    changes = poses.changes or (CameraChange(),) * views
+    offset = [math.log(changes[0].sdd_factor)] + [mm for change in changes for mm in change.principal_point_shift_mm]
+    sdd_mm = scene.camera(poses, 0).sdd_mm
+    depths = [float(reference_point_in_view(scene, poses, scene.anchor, view)[2]) for view in range(views)]
+    reach = torch.tensor(depths, dtype=torch.float64) / sdd_mm
+    if scene.camera_from_camera1 is not None:
+        reach = torch.zeros_like(reach)
+    return Intrinsics(tuple(objects), reach.new_tensor(scale), reach.new_tensor(offset), reach, sdd_mm)

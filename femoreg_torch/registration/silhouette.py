@@ -62,14 +62,15 @@ def refine_by_silhouette(
     seen: Segmentation,
     attenuation: Tensor,
     camera: Camera,
+    field: Tensor | None = None,
 ) -> SilhouetteFit:
     """The pose near `camera_from_ct` (4, 4) where the bones of `outline` cover those of the segmentation.
 
     `covariance` (6, 6) of the start is about `centre` (3,), mm in the camera frame. `attenuation` (H, W) of `camera` is
-    the image; where it stands at its least or greatest value (shutters, saturation) nothing is compared, nor where the
-    segmentation sees bones that may hide those of the outline.
+    the image; outside its exposed `field` (H, W), bool, and where it stands at its least or greatest value (shutters,
+    saturation) nothing is compared, nor where the segmentation sees bones that may hide those of the outline.
     """
-    looked_at = _looked_at(seen, outline, anatomy, attenuation, camera)
+    looked_at = _looked_at(seen, outline, anatomy, attenuation, camera, field)
     target = seen.probabilities[list(anatomy.classes(outline.bones))].sum(0)[looked_at].double()
     root = torch.linalg.cholesky(covariance.double())  # twist = root · u, with u of unit variance
 
@@ -100,7 +101,14 @@ def refine_by_silhouette(
     return SilhouetteFit(poses(best[None])[0], overlap, posterior)
 
 
-def _looked_at(seen: Segmentation, outline: Outline, anatomy: Anatomy, attenuation: Tensor, camera: Camera) -> Tensor:
+def _looked_at(
+    seen: Segmentation,
+    outline: Outline,
+    anatomy: Anatomy,
+    attenuation: Tensor,
+    camera: Camera,
+    field: Tensor | None,
+) -> Tensor:
     """Pixels (h, w) of the segmentation's grid that are compared."""
     others = (*anatomy.hides_outline, *(bone for bone in anatomy.outline if bone not in outline.bones))
     compared, hiding = (
@@ -108,7 +116,8 @@ def _looked_at(seen: Segmentation, outline: Outline, anatomy: Anatomy, attenuati
     )
     near = dilated(compared, _BAND_MM, seen.camera)
     hidden = dilated(hiding, _HIDDEN_MARGIN_MM, seen.camera)
-    low, high = attenuation.aminmax()
-    extreme = to_network_grid(((attenuation <= low) | (attenuation >= high)).float(), camera)
+    field = torch.ones_like(attenuation, dtype=torch.bool) if field is None else field
+    low, high = attenuation[field].aminmax()
+    extreme = to_network_grid(((attenuation <= low) | (attenuation >= high) | ~field).float(), camera)
     covered = F.interpolate(extreme[None, None], seen.camera.shape, mode="area")[0, 0] > 0.5
     return near & ~hidden & ~dilated(covered, _HIDDEN_MARGIN_MM, seen.camera)

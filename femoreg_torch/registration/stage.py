@@ -1,8 +1,8 @@
 """A stage: one optimisation of bodies over images, or one for each other view."""
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -11,16 +11,18 @@ from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
 from femoreg_torch.optimize import Optimiser
+from femoreg_torch.registration.imaging import PLAIN, Imaging
+from femoreg_torch.registration.intrinsics import Intrinsics, doubt
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.moments import moments_of
-from femoreg_torch.registration.objective import PLAIN, Imaging, Prior, image_costs, stage_objective
+from femoreg_torch.registration.objective import ImageCosts, Prior, image_costs, image_quadratic, stage_objective
 from femoreg_torch.registration.restarts import restarts_of
-from femoreg_torch.registration.scene import Body, Kind, Scene, moved, reference_point_in_view
+from femoreg_torch.registration.scene import Body, Kind, Moving, Scene, intrinsics_of, moved, reference_point_in_view
 from femoreg_torch.registration.step import (
     ALL,
     CARM_IS_KNOWN,
     ONE_VIEW,
-    check_placed,
+    check_known,
     chosen_kinds,
     chosen_objects,
     lacking,
@@ -28,7 +30,7 @@ from femoreg_torch.registration.step import (
 from femoreg_torch.registration.weights import Weighting
 from femoreg_torch.similarity import Similarity
 
-EACH, VIEW, VIEWS = "each", "view", "views"
+EACH, VIEW, VIEWS, INTRINSICS = "each", "view", "views", "intrinsics"
 
 
 @dataclass(frozen=True)
@@ -41,15 +43,29 @@ class BodyPlan:
     along columns, y along rows, z depth): the standard deviation of random candidates for CMA-ES and
     Levenberg–Marquardt, the half-width of the box for BOBYQA. Zero freezes an axis. `centre` names the object whose
     reference point it turns about: by default its own, that of the first if several are named, and for [all], [view]
-    and [views] that of the scene's anchor.
+    and [views] that of the scene's anchor. Objects that no image of the case shows are passed over, and a body stays
+    where it is in a stage whose images show nothing of it.
+    [intrinsics] are the cameras themselves: the source distance of all views
+    and the principal point of each, as far as the C-arm's file is uncertain of them. With `doubt` they
+    move only where they were refined before, or where the images, all else settled, doubt them by so many standard
+    deviations: images that are drawn a little wrong feign a little other intrinsics, and a C-arm's file may be right.
     """
 
     move: list[str]
-    rotation_deg: list[float]
-    translation_mm: list[float]
+    rotation_deg: list[float] = field(default_factory=list)
+    translation_mm: list[float] = field(default_factory=list)
     centre: str | None = None
+    doubt: float | None = None
 
     def __post_init__(self) -> None:
+        if self.is_intrinsics:
+            if self.rotation_deg or self.translation_mm or self.centre is not None:
+                raise InputError(
+                    f"`move: [{INTRINSICS}]` takes `doubt` alone; the C-arm's file says how far they move."
+                )
+            return
+        if self.doubt is not None:
+            raise InputError(f"`doubt` is for `move: [{INTRINSICS}]` alone.")
         if len(self.rotation_deg) != 3 or len(self.translation_mm) != 3:
             raise InputError("rotation_deg and translation_mm need three numbers, one per camera axis.")
         if not self.move:
@@ -60,39 +76,51 @@ class BodyPlan:
         """Whether it is the C-arm that moves."""
         return self.move in ([VIEW], [VIEWS])
 
-    def names(self, scene: Scene, poses: Poses) -> set[str]:
-        """The names of all objects that it moves or turns about."""
-        if self.move == [EACH]:
-            return set() if self.centre is None else {self.centre}
-        moving = [] if self.is_carm else chosen_objects(self.move, poses)
-        return {*moving, self._about(scene, moving)}
+    @property
+    def is_intrinsics(self) -> bool:
+        """Whether it stands for the cameras."""
+        return self.move == [INTRINSICS]
 
-    def bodies(self, scene: Scene, poses: Poses, kinds: list[Kind], views: tuple[int, ...]) -> list[Body]:
-        """The bodies that it stands for in images of the given kinds and views (from 0)."""
+    @property
+    def names(self) -> set[str]:
+        """The names of objects that it moves or turns about."""
+        moving = () if self.is_carm or self.is_intrinsics or self.move == [EACH] else self.move
+        return {*moving, *(() if self.centre is None else (self.centre,))}
+
+    def bodies(
+        self, scene: Scene, poses: Poses, kinds: list[Kind], views: tuple[int, ...], render: Sequence[str] = (ALL,)
+    ) -> Sequence[Moving]:
+        """What it stands for in those images of the given kinds and views (from 0) that there are, of drawn objects."""
+        images = scene.there(kinds, views)
+        if self.is_intrinsics:
+            return [intrinsics_of(scene, poses, chosen_objects(render, poses))]
         scale = torch.tensor([*self.rotation_deg, *self.translation_mm], dtype=torch.float64)
         scale[:3] *= torch.pi / 180
 
         def body(names: list[str], view: int) -> Body:
-            return Body(
-                tuple(names), view, reference_point_in_view(scene, poses, self._about(scene, names), view), scale
-            )
+            about = self._about(scene, poses, names)
+            return Body(tuple(names), view, reference_point_in_view(scene, poses, about, view), scale)
 
         if self.is_carm:
-            return [body([], view) for view in views if view and scene.camera_from_camera1 is None]
-        if self.move == [EACH]:
-            return [body([name], 0) for name in poses.camera1_from if any(scene.shown([name], kind) for kind in kinds)]
-        return [body(chosen_objects(self.move, poses), 0)]
+            seen = {view for _, view in images} if scene.camera_from_camera1 is None else set()
+            return [body([], view) for view in views if view and view in seen]
+        moving = chosen_objects([ALL] if self.move == [EACH] else self.move, poses)
+        together = [[name] for name in moving] if self.move == [EACH] else [moving]
+        return [body(names, 0) for names in together if any(scene.shown(names, kind) for kind, _ in images)]
 
-    def _about(self, scene: Scene, moving: list[str]) -> str:
+    def _about(self, scene: Scene, poses: Poses, moving: list[str]) -> str:
         """The object whose reference point a body turns about."""
-        return self.centre or (moving[0] if moving and self.move != [ALL] else scene.anchor)
+        if self.centre in poses.camera1_from:
+            return self.centre
+        return moving[0] if moving and self.move != [ALL] else scene.anchor
 
 
 @dataclass(frozen=True)
 class Stage:
     """One optimisation. `images` says which views take part: the first, each other view by itself, or all together.
 
-    Objects are named as in the scene; [all] in `render` or `kinds` stands for all. `weights` says which pixels count,
+    Objects are named as in the scene; [all] in `render` or `kinds` stands for all. Of the images of these kinds, those
+    that there are take part. `weights` says which pixels count,
     see `pixel_weights`; by default all do. `imaging` says what is drawn besides the objects; by default nothing.
     """
 
@@ -109,32 +137,57 @@ class Stage:
     imaging: Imaging = PLAIN
 
     def __post_init__(self) -> None:
-        for word, images in ((VIEW, "each other"), (VIEWS, "all")):
+        for word, images in ((VIEW, "each other"), (VIEWS, "all"), (INTRINSICS, "all")):
             if self.images != images and any(body.move == [word] for body in self.bodies):
                 raise InputError(f"`move: [{word}]` needs `images: {images}`.")
 
     def left_out(self, scene: Scene, poses: Poses) -> str | None:
         """Why it has nothing to do, see `Step`."""
-        if reason := lacking(chosen_kinds(self.kinds, scene), scene):
-            return reason
-        named = (body.names(scene, poses) for body in self.bodies)
-        check_placed({*chosen_objects(self.render, poses)}.union(*named), poses)
+        kinds = chosen_kinds(self.kinds, scene)
+        check_known({*self.render}.union(*(body.names for body in self.bodies)), kinds, scene, poses)
         if scene.views == 1 and (self.images == "each other" or self._moves_only_the_carm):
             return ONE_VIEW
         if scene.camera_from_camera1 is not None and self._moves_only_the_carm:
             return CARM_IS_KNOWN
+        if reason := lacking(kinds, self._views(scene), scene):
+            return reason
+        if not any(self.moving(scene, poses, views) for views in self._parts(scene)):
+            return "its images show nothing of what it moves"
         return None
 
     def run(self, scene: Scene, poses: Poses, seed: int) -> Iterator[StageRecord]:
         """The optimisation, or one for each other view from the poses after the one before, see `Step`."""
-        others = range(1, scene.views)
-        if self.images != "each other":
-            yield run_stage(scene, poses, self, (0,) if self.images == "first" else (0, *others), seed)
-            return
-        for view in others:
-            record = run_stage(scene, poses, self, (view,), seed)
-            poses = record.poses
-            yield record
+        for views in self._parts(scene):
+            if self.moving(scene, poses, views):
+                record = run_stage(scene, poses, self, views, seed)
+                poses = record.poses
+                yield record
+
+    def _views(self, scene: Scene) -> tuple[int, ...]:
+        """The views (from 0) that take part."""
+        every = tuple(range(scene.views))
+        return {"first": every[:1], "each other": every[1:], "all": every}[self.images]
+
+    def _parts(self, scene: Scene) -> list[tuple[int, ...]]:
+        """The views of each optimisation: all at once, or one after another."""
+        views = self._views(scene)
+        return [(view,) for view in views] if self.images == "each other" else [views]
+
+    def moving(self, scene: Scene, poses: Poses, views: tuple[int, ...]) -> tuple[Moving, ...]:
+        """The bodies that its images of these views (from 0) show, and the cameras if any body is there."""
+        kinds = chosen_kinds(self.kinds, scene)
+        plans = [plan.bodies(scene, poses, kinds, views, self.render) for plan in self.bodies]
+        found = tuple(body for bodies in plans for body in bodies)
+        return found if any(isinstance(body, Body) for body in found) else ()
+
+    @property
+    def doubt(self) -> float | None:
+        """How strongly the images must doubt the C-arm's file before its intrinsics move; None: they need not."""
+        return next((plan.doubt for plan in self.bodies if plan.doubt is not None), None)
+
+    def with_free_intrinsics(self) -> "Stage":
+        """The same stage with intrinsics that wait for no doubt."""
+        return replace(self, bodies=[replace(plan, doubt=None) for plan in self.bodies])
 
     @property
     def _moves_only_the_carm(self) -> bool:
@@ -142,28 +195,58 @@ class Stage:
 
 
 def run_stage(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], seed: int) -> StageRecord:
-    """Optimise the bodies of one stage over the given views (from 0)."""
+    """Optimise the bodies of one stage over the given views (from 0).
+
+    Where its intrinsics wait for a doubt, the images are asked once all else has settled; if they doubt the C-arm's
+    file, the stage goes on from there with the intrinsics free.
+    """
     began = time.perf_counter()
-    kinds = chosen_kinds(stage.kinds, scene)
-    render = chosen_objects(stage.render, poses)
-    bodies = tuple(body for plan in stage.bodies for body in plan.bodies(scene, poses, kinds, views))
-    images: list[tuple[Kind, int]] = [(kind, view) for kind in kinds for view in views]
-    costs = image_costs(
-        scene, poses, bodies, render, images, stage.level, stage.similarity, stage.weights, stage.imaging
-    )
-    objective = stage_objective(costs, bodies, stage.prior)
+    bodies = stage.moving(scene, poses, views)
+    waiting = None if poses.changes else stage.doubt
+    if waiting is not None:
+        bodies = tuple(body for body in bodies if isinstance(body, Body))
+    objective = stage_objective(_costs(scene, poses, stage, views, bodies), bodies, stage.prior)
     result = stage.optimiser.minimise(objective, sum(len(body.free) for body in bodies), seed)
-    seconds = time.perf_counter() - began
-    turned = any(body.view for body in bodies)
-    return StageRecord(
+    rigid = [body for body in bodies if isinstance(body, Body)]
+    turned = len(rigid) < len(bodies) or any(body.view for body in rigid)
+    record = StageRecord(
         stage.name,
         views[0] + 1 if stage.images == "each other" else None,
         result.value,
         result.evaluations,
-        seconds,
+        time.perf_counter() - began,
         result.stop.value,
         moved(poses, bodies, result.delta),
         restarts_of(result, scene, bodies, lambda delta: moved(poses, bodies, delta)),
         moments_of(result, lambda delta: moved(poses, bodies, delta)),
-        tuple(poses.camera1_from) if turned else tuple(name for body in bodies for name in body.objects),
+        tuple(poses.camera1_from) if turned else tuple(name for body in rigid for name in body.objects),
     )
+    if waiting is None or _doubt(scene, record.poses, stage, views) < waiting:
+        return replace(record, seconds=time.perf_counter() - began)
+    after = run_stage(scene, record.poses, stage.with_free_intrinsics(), views, seed)
+    later = tuple(replace(m, evaluations=m.evaluations + record.evaluations) for m in after.moments)
+    return replace(
+        after,
+        evaluations=record.evaluations + after.evaluations,
+        seconds=time.perf_counter() - began,
+        restarts=record.restarts + after.restarts,
+        moments=record.moments + later,
+    )
+
+
+def _costs(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], bodies: tuple[Moving, ...]) -> ImageCosts:
+    render = chosen_objects(stage.render, poses)
+    images = scene.there(chosen_kinds(stage.kinds, scene), views)
+    return image_costs(
+        scene, poses, bodies, render, images, stage.level, stage.similarity, stage.weights, stage.imaging
+    )
+
+
+def _doubt(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...]) -> float:
+    """By how many standard deviations the stage's images doubt the C-arm's file."""
+    bodies = stage.moving(scene, poses, views)
+    refined = next((body for body in bodies if isinstance(body, Intrinsics)), None)
+    if refined is None:
+        return 0.0
+    costs = _costs(scene, poses, stage, views, bodies)
+    return doubt(image_quadratic(costs, costs.still), refined)

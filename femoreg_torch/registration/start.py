@@ -8,7 +8,7 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, Anatomy
 from femoreg_torch.case import Case, LandmarkRecord, StartRecord
-from femoreg_torch.detect import Detection
+from femoreg_torch.detect import Detection, filled, within_field
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, transform_points
 from femoreg_torch.pnp import MINIMUM, PnpResult, solve_pnp
@@ -41,12 +41,13 @@ def start_by_detection(case: Case, scene: Scene, detection: Detection) -> StartR
 
     Raises `InputError` as `find_start` does, with the image's name.
     """
-    image = scene.images[scene.first_kind][0]
+    image, field = scene.image(scene.first_kind, 0), scene.field(scene.first_kind, 0)
+    anatomy = case.anatomy or HIP
     try:
-        start = find_start(case.landmarks, detection, image, case.carm.camera, scene.outline, case.anatomy or HIP)
+        start = find_start(case.landmarks, detection, image, case.carm.camera, scene.outline, anatomy, field)
     except InputError as error:
         raise InputError(f"{case.views[0].images[scene.first_kind]}: {error}") from error
-    return _record(scene.anchor, detection, start, (case.anatomy or HIP).landmark_names)
+    return _record(scene.anchor, detection, start, anatomy.landmark_names)
 
 
 def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) -> StartRecord:
@@ -89,8 +90,11 @@ def find_start(
     camera: Camera,
     outline: Outline | None,
     anatomy: Anatomy,
+    field: Tensor | None = None,
 ) -> Start:
     """The pose of a CT with `landmarks` (3,) in an image (H, W), by PnP and then by the outlines of its bones.
+
+    `field` (H, W), bool, is the exposed part of the image; None: all of it.
 
     Raises `InputError` if the grey values are inverted, which would mislead the similarity even where the landmarks are
     found, if fewer than four landmarks are of use or agree, if the bones drawn at the pose cover those that the
@@ -121,7 +125,7 @@ def find_start(
     centre = transform_points(pnp.camera_from_object, points).mean(0)
     bones = Segmentation(detection.segmentation, detection.network_camera)
     fit = refine_by_silhouette(
-        outline, anatomy, pnp.camera_from_object, centre, pnp.covariance, bones, attenuation, camera
+        outline, anatomy, pnp.camera_from_object, centre, pnp.covariance, bones, attenuation, camera, field
     )
     if fit.overlap < LEAST_OVERLAP:
         raise InputError(
@@ -141,9 +145,17 @@ def _check_rotation(pnp: PnpResult) -> None:
         )
 
 
+def look_at(scene: Scene, view: int, find: Detector) -> Detection:
+    """What `find` sees in the first image of a view (from 0); landmarks outside its exposed field are not visible."""
+    image, field = scene.image(scene.first_kind, view), scene.field(scene.first_kind, view)
+    if field is None:
+        return find(image, scene.carm.camera)
+    return within_field(find(filled(image, field), scene.carm.camera), field)
+
+
 def with_segmentations(scene: Scene, first: Detection, find: Detector) -> Scene:
     """The scene with what the network sees of the bones in every view; `first` is what it saw in view 1."""
-    others = [find(image, scene.carm.camera) for image in scene.images[scene.first_kind][1:]]
+    others = [look_at(scene, view, find) for view in range(1, scene.views)]
     seen = tuple(Segmentation(found.segmentation, found.network_camera) for found in (first, *others))
     return replace(scene, segmentations=seen)
 

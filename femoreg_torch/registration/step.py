@@ -1,6 +1,6 @@
 """What every step of a plan is, and what the words in it stand for."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Protocol
 
 from femoreg_torch.case.trace import StageRecord
@@ -37,19 +37,27 @@ def chosen_kinds(kinds: Sequence[Kind], scene: Scene) -> list[Kind]:
 
 
 def chosen_objects(names: Sequence[str], poses: Poses) -> list[str]:
-    """The objects that a step names; [all] stands for all that have a pose."""
-    return list(poses.camera1_from) if list(names) == [ALL] else list(names)
+    """The objects with a pose that a step names; [all] stands for all of them."""
+    return list(poses.camera1_from) if list(names) == [ALL] else [name for name in names if name in poses.camera1_from]
 
 
-def lacking(kinds: Iterable[Kind], scene: Scene) -> str | None:
-    """What kind of images a scene lacks, as the end of a sentence."""
-    missing = next((kind for kind in kinds if kind not in scene.images), None)
-    return None if missing is None else f"not every view of this case has an image of the kind “{missing}”"
+def lacking(kinds: Sequence[Kind], views: Collection[int], scene: Scene) -> str | None:
+    """Why there is nothing to see in images of some kinds and views (from 0), as the end of a sentence."""
+    if scene.there(kinds, views):
+        return None
+    named = " or ".join(f"“{kind}”" for kind in kinds)
+    where = "" if len(views) == scene.views else f" in view {', '.join(str(view + 1) for view in views)}"
+    return f"there is no image of the kind {named}{where}"
 
 
-def check_placed(names: Iterable[str], poses: Poses) -> None:
-    """Raise `InputError` that names the first object without a pose."""
-    for name in sorted(set(names) - set(poses.camera1_from)):
+def check_known(names: Iterable[str], kinds: Iterable[Kind], scene: Scene, poses: Poses) -> None:
+    """Raise `InputError` that names the first object which the scene does not know.
+
+    Where the scene has no image of one of a step's `kinds`, its names may be of objects that only those would show.
+    """
+    if any(kind not in scene.images for kind in kinds):
+        return
+    for name in sorted(set(names) - {ALL} - set(scene.objects)):
         raise InputError(
             f"the images of this case hold no object “{name}”; there are: {', '.join(poses.camera1_from)}."
         )

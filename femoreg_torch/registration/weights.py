@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -11,7 +12,9 @@ from torch.nn import functional as F
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, Poses, project_points
+from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.scene import Kind, Scene, Segmentation
+from femoreg_torch.similarity import FixedSimilarity, Similarity, against_field
 
 # bones: the objects that the stage draws, where the network sees them. What the network does not know (an instrument)
 # counts where it is drawn at its present pose.
@@ -60,12 +63,31 @@ def pixel_weights(
     return looked_at.float()
 
 
+def prepared(
+    scene: Scene, image: tuple[Kind, int], level: Level, similarity: Similarity, weights: Tensor | None = None
+) -> FixedSimilarity:
+    """A similarity against an image (kind, view) at a level, by what is exposed; `weights` (H, W) are of its pixels.
+
+    Raises `InputError` where nothing is left to compare.
+    """
+    kind, view = image
+    camera = scene.carm.camera
+    exposed = scene.field(kind, view)
+    field = None if exposed is None else level.field(exposed, camera)
+    try:
+        return against_field(similarity, level.image(scene.image(kind, view), camera), weights, field)
+    except InputError as error:
+        raise InputError(f"view {view + 1}, {kind} image: {error}") from error
+
+
 def _bones(scene: Scene, poses: Poses, names: Sequence[str], view: int, camera: Camera, step_mm: float) -> Tensor:
     """The pixels (H, W) near the named objects."""
     if not scene.segmentations:
         raise InputError("weights [bones]: the scene has no segmentations. Add them with `with_segmentations`.")
     classes = sorted({label for name in names for label in scene.objects[name].classes})
-    seen = _on_grid(scene.segmentations[view], camera)[classes].sum(0) >= _LEAST_PROBABILITY
+    segmentation = scene.segmentations[view]
+    segmentation = replace(segmentation, camera=poses.camera(view, segmentation.camera))  # on the same detector
+    seen = _on_grid(segmentation, camera)[classes].sum(0) >= _LEAST_PROBABILITY
     unknown = [name for name in names if not scene.objects[name].classes]
     return dilated(seen | _silhouette(scene, poses, unknown, view, camera, step_mm), _BONE_MARGIN_MM, camera)
 

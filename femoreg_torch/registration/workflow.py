@@ -1,6 +1,6 @@
 """The registration workflow: from start poses through the steps of a plan (paper, section II-B)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -8,6 +8,7 @@ from torch import Tensor
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
+from femoreg_torch.registration.calibration import Calibration
 from femoreg_torch.registration.plan import Plan
 from femoreg_torch.registration.scene import Scene
 
@@ -18,6 +19,7 @@ Report = Callable[[str, float], None]  # what is done, and the share of the plan
 class Outcome:
     """Poses at the end of a plan, what every step did, and which were left out."""
 
+    scene: Scene  # with what was estimated of the images
     poses: Poses
     trace: tuple[StageRecord, ...]
     skipped: tuple[str, ...]  # sentences for people
@@ -40,13 +42,18 @@ def run_plan(
         step = plan.steps[number]
         if report:
             report(step.name, done / len(numbers))
-        for record in step.run(scene, poses, seed * 1000 + number):
+        if isinstance(step, Calibration):
+            scene, record = step.calibrate(scene, poses)
+            records: Iterable[StageRecord] = [record]
+        else:
+            records = step.run(scene, poses, seed * 1000 + number)
+        for record in records:
             trace.append(record)
             poses = record.poses
     if report:
         report("done", 1.0)
     skipped = (f"stage “{plan.steps[n].name}” was left out: {reason}" for n, reason in reasons.items() if reason)
-    return Outcome(poses, tuple(trace), tuple(skipped))
+    return Outcome(scene, poses, tuple(trace), tuple(skipped))
 
 
 def _left_out(plan: Plan, number: int, scene: Scene, poses: Poses) -> str | None:

@@ -1,19 +1,27 @@
 """Image similarities: settings that, prepared with a fixed image, map moving images (B, H, W) to costs (B,)."""
 
 from femoreg_torch.similarity.grad_ncc import GradNcc
-from femoreg_torch.similarity.interface import FixedSimilarity, Similarity, SmoothFixedSimilarity
+from femoreg_torch.similarity.interface import (
+    FieldSimilarity,
+    FixedSimilarity,
+    Similarity,
+    SmoothFixedSimilarity,
+    against_field,
+)
 from femoreg_torch.similarity.kinds import read_similarity
 from femoreg_torch.similarity.ncc import Ncc
 from femoreg_torch.similarity.orientation import GradientOrientation
 from femoreg_torch.similarity.quadratic import similarity_quadratic
 
 __all__ = [
+    "FieldSimilarity",
     "FixedSimilarity",
     "GradNcc",
     "GradientOrientation",
     "Ncc",
     "Similarity",
     "SmoothFixedSimilarity",
+    "against_field",
     "read_similarity",
     "similarity_quadratic",
 ]

@@ -10,7 +10,14 @@ from torch.autograd.function import once_differentiable
 from femoreg_torch.similarity import cpu
 from femoreg_torch.similarity.checks import check_patches, check_size, check_weights
 from femoreg_torch.similarity.curvature import patch_curvature
-from femoreg_torch.similarity.kernels import FLAT, derivative_taps, image_gradients, patch_sums, patch_weights
+from femoreg_torch.similarity.kernels import (
+    FLAT,
+    away_from,
+    derivative_taps,
+    image_gradients,
+    patch_sums,
+    patch_weights,
+)
 from femoreg_torch.similarity.quadratic import tile_scores
 
 _TILE = 4  # patches along the edge of a tile: so large that the tiles' shares are nearly independent
@@ -34,6 +41,10 @@ class GradNcc:
 
         Raises `InputError` if no patch fits or all weights are zero.
         """
+        return self.inside(None, fixed, weights)
+
+    def inside(self, field: Tensor | None, fixed: Tensor, weights: Tensor | None = None) -> "FixedGradNcc":
+        """As `against`, by the patches whose derivatives need no pixel outside `field`, see `FieldSimilarity`."""
         radius = self.patch_radius
         check_patches(fixed, radius)
         check_weights(fixed, weights)
@@ -43,7 +54,8 @@ class GradNcc:
         mean = patch_sums(maps, radius) / n
         spread = patch_sums(maps**2, radius) - n * mean**2
         scale = torch.where(spread > FLAT, spread.clamp(min=FLAT).rsqrt(), torch.zeros_like(spread))
-        share = patch_weights(weights, (fixed.shape[0], fixed.shape[1]), radius).to(mean.device)
+        kept = None if field is None else away_from(~field, len(taps[0]) // 2)
+        share = patch_weights(weights, (fixed.shape[0], fixed.shape[1]), radius, kept).to(mean.device)
         return FixedGradNcc(maps, mean, scale, share, radius, taps)
 
 

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from femoreg_torch.errors import InputError
 from femoreg_torch.similarity import cpu
 
 FLAT = 1e-10  # sum of squared deviations below which a patch counts as flat: line integrals are of order 1
@@ -60,12 +61,22 @@ def patch_sums(maps: Tensor, radius: int) -> Tensor:
     return total[..., side:, :] - total[..., :-side, :]
 
 
-def patch_weights(weights: Tensor | None, shape: tuple[int, int], radius: int) -> Tensor:
+def patch_weights(weights: Tensor | None, shape: tuple[int, int], radius: int, field: Tensor | None = None) -> Tensor:
     """Weights (H − 2r, W − 2r) float64 of the patches, summing to one, from pixel weights (H, W) or equal ones.
 
-    A patch weighs what its pixels weigh on average.
+    A patch weighs what its pixels weigh on average, and nothing unless it lies wholly in `field` (H, W), bool. Raises
+    `InputError` if none does that weighs anything.
     """
     if weights is None:
         weights = torch.ones(shape)
     sums = patch_sums(weights, radius).clamp(min=0)
+    if field is not None:
+        sums = sums * (patch_sums((~field).float(), radius) < 0.5)
+    if not sums.any():
+        raise InputError(f"similarity: no patch of radius {radius} lies wholly where there is something to compare.")
     return sums / sums.sum()
+
+
+def away_from(outside: Tensor, reach: int) -> Tensor:
+    """The pixels (H, W), bool, that are more than `reach` pixels away, along rows and columns, from those of a mask."""
+    return F.max_pool2d(outside[None].float(), 2 * reach + 1, 1, reach)[0] == 0

@@ -25,13 +25,19 @@ class Ncc:
         Over patches, a patch weighs what its pixels weigh on average. Raises `InputError` if no patch fits or all
         weights are zero.
         """
+        return self.inside(None, fixed, weights)
+
+    def inside(self, field: Tensor | None, fixed: Tensor, weights: Tensor | None = None) -> "FixedNcc | FixedPatchNcc":
+        """As `against`, by the pixels of `field`, or by the patches wholly within it, see `FieldSimilarity`."""
+        if field is not None and self.patch_radius is None:
+            weights = field.to(fixed) if weights is None else weights * field
         check_weights(fixed, weights)
         if self.patch_radius is None:
             return FixedNcc(
                 fixed.to(torch.float64), None if weights is None else weights.to(fixed.device, torch.float64)
             )
         check_patches(fixed, self.patch_radius)
-        share = patch_weights(weights, (fixed.shape[0], fixed.shape[1]), self.patch_radius).to(fixed.device)
+        share = patch_weights(weights, (fixed.shape[0], fixed.shape[1]), self.patch_radius, field).to(fixed.device)
         return FixedPatchNcc(fixed.to(torch.float64), share, self.patch_radius)
 
 

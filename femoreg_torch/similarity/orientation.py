@@ -7,7 +7,7 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.similarity.checks import check_size, check_weights
-from femoreg_torch.similarity.kernels import derivative_taps, image_gradients
+from femoreg_torch.similarity.kernels import away_from, derivative_taps, image_gradients
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,22 @@ class GradientOrientation:
 
         Raises `InputError` if the fixed image has no edge there.
         """
+        return self.inside(None, fixed, weights)
+
+    def inside(self, field: Tensor | None, fixed: Tensor, weights: Tensor | None = None) -> "FixedGradientOrientation":
+        """As `against`, by the pixels whose derivatives need none outside `field`, see `FieldSimilarity`."""
         check_weights(fixed, weights)
         taps = derivative_taps(self.smoothing_px, fixed.device)
         maps = image_gradients(fixed[None], taps)[0]
         strength = maps.square().sum(0)
-        strong = (strength > strength.median()) & (strength > 0)
+        kept = torch.ones_like(strength, dtype=torch.bool) if field is None else away_from(~field, len(taps[0]) // 2)
+        if not kept.any():
+            raise InputError("similarity: the field leaves no pixel to compare.")
+        strong = (strength > strength[kept].median()) & (strength > 0) & kept
         share = torch.ones_like(fixed) if weights is None else weights.to(fixed)
         if not (strong & (share > 0)).any():
             raise InputError("similarity: the fixed image has no edge where it is to be compared.")
-        return FixedGradientOrientation(maps, strong, share, taps)
+        return FixedGradientOrientation(maps, strong, share, kept, taps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +50,7 @@ class FixedGradientOrientation:
     fixed: Tensor  # (2, H, W) derivatives
     strong: Tensor  # (H, W) bool: edges of the fixed image that count
     weights: Tensor  # (H, W)
+    kept: Tensor  # (H, W) bool: pixels that are looked at
     taps: tuple[Tensor, Tensor]  # of the derivative, see `derivative_taps`
 
     def __call__(self, images: Tensor) -> Tensor:
@@ -53,7 +61,7 @@ class FixedGradientOrientation:
         check_size(images, self.fixed)
         moving = image_gradients(images, self.taps)  # (B, 2, H, W)
         strength = moving.detach().square().sum(1)
-        counts = self.strong & (strength > strength.flatten(1).median(1).values[:, None, None]) & (strength > 0)
+        counts = self.strong & (strength > strength[:, self.kept].median(1).values[:, None, None]) & (strength > 0)
         dot = (moving * self.fixed).sum(1)
         cross = moving[:, 0] * self.fixed[1] - moving[:, 1] * self.fixed[0]
         # Where nothing is compared, a dummy angle keeps the gradient of atan2 finite.

@@ -2,26 +2,32 @@
 
 from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
 from femoreg_torch.volume.bones import BoneLabels, bone_labels
-from femoreg_torch.volume.device import labelled_device, scanned_device
+from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
 from femoreg_torch.volume.grid import Volume, axis_aligned
 from femoreg_torch.volume.labels import label_box_centre
 from femoreg_torch.volume.landmarks import check_inside, read_landmarks, write_landmarks
-from femoreg_torch.volume.mesh import check_closed, read_mesh, voxelise_mesh
+from femoreg_torch.volume.mesh import check_closed, voxelise_mesh
+from femoreg_torch.volume.mesh_files import bounds_of, read_bodies, read_mesh
 from femoreg_torch.volume.reading import read_ct, read_label_map, read_labels, read_volume, write_volume
 from femoreg_torch.volume.resample import crop, resample_isotropic
 from femoreg_torch.volume.segments import segment_names
+from femoreg_torch.volume.solids import Solid, solid_volumes
 
 __all__ = [
     "BoneLabels",
+    "Solid",
     "Volume",
     "axis_aligned",
     "bone_labels",
+    "bounds_of",
     "check_closed",
     "check_inside",
     "crop",
     "hu_to_attenuation",
     "label_box_centre",
+    "label_share",
     "labelled_device",
+    "read_bodies",
     "read_ct",
     "read_label_map",
     "read_labels",
@@ -31,6 +37,7 @@ __all__ = [
     "resample_isotropic",
     "scanned_device",
     "segment_names",
+    "solid_volumes",
     "structure_attenuation",
     "voxelise_mesh",
     "write_landmarks",

@@ -21,7 +21,16 @@ _EMPTY_HU = -500.0  # half-way between air and water: below it a voxel counts as
 
 
 def labelled_device(path: Path, ids: Sequence[int], hu: float, spacing_mm: float) -> Volume:
-    """Attenuation (1/mm) of a solid of `hu` in the voxels with these label `ids`, cropped, HU counted from air.
+    """Attenuation (1/mm) of a solid of `hu` in the voxels with these label `ids`, HU counted from air.
+
+    Grid and errors are those of `label_share`.
+    """
+    share = label_share(path, ids, spacing_mm)
+    return share.with_data(share.data * hu_to_attenuation(torch.tensor(float(hu)), _AIR_HU))
+
+
+def label_share(path: Path, ids: Sequence[int], spacing_mm: float) -> Volume:
+    """How much of each voxel belongs to these label `ids`, 0 to 1, cropped.
 
     The edge is softened over a voxel, where a voxelised mesh has partial volumes; voxels finer than `spacing_mm`
     are averaged to it. Raises `InputError` for labels that are not whole numbers, or if one of the ids does not occur.
@@ -35,8 +44,8 @@ def labelled_device(path: Path, ids: Sequence[int], hu: float, spacing_mm: float
     inside = volume.with_data(torch.from_numpy(np.isin(volume.data.numpy(), list(ids))).float())
     padded = _padded_to_content(inside, inside.data > 0)
     soft = torch.from_numpy(ndimage.gaussian_filter(padded.data.numpy(), _EDGE_SIGMA)).clamp(0, 1)
-    attenuation = padded.with_data(soft * hu_to_attenuation(torch.tensor(float(hu)), _AIR_HU))
-    return resample_isotropic(attenuation, spacing_mm) if min(volume.spacing_mm) < spacing_mm else attenuation
+    share = padded.with_data(soft)
+    return resample_isotropic(share, spacing_mm) if min(volume.spacing_mm) < spacing_mm else share
 
 
 def scanned_device(path: Path) -> Volume:

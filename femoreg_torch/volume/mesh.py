@@ -1,10 +1,8 @@
 """Devices: closed CAD meshes in mm, and their voxels.
 
-Formats, closedness and orientation are trimesh's. Its voxels, however, are either inside or outside; a projector needs
+Closedness and orientation are trimesh's. Its voxels, however, are either inside or outside; a projector needs
 the fraction of each that is inside, or thin walls come out by up to half a voxel too thick or thin.
 """
-
-from pathlib import Path
 
 import numba
 import numpy as np
@@ -37,20 +35,6 @@ def check_closed(mesh: trimesh.Trimesh, where: str) -> trimesh.Trimesh:
         mesh = mesh.copy()
         mesh.invert()
     return mesh
-
-
-def read_mesh(path: Path) -> trimesh.Trimesh:
-    """A closed surface in mm from an STL, PLY, OBJ or OFF file, equal vertices merged. Raises `InputError`."""
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
-    try:
-        mesh = trimesh.load_mesh(path, process=True)
-    except Exception as error:  # trimesh's readers raise whatever their parsing runs into
-        raise InputError(f"{path}: cannot be read as a mesh (STL, PLY, OBJ or OFF): {error}.") from error
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise InputError(f"{path}: one triangle mesh was expected, found {type(mesh).__name__}.")
-    return check_closed(mesh, str(path))
 
 
 @numba.njit(cache=True)
@@ -100,13 +84,25 @@ def voxelise_mesh(mesh: trimesh.Trimesh, spacing_mm: float, hu: float) -> Volume
     Raises `InputError` for an open mesh.
     """
     mesh = check_closed(mesh, "device")
-    lowest = mesh.bounds[0] - _MARGIN * spacing_mm  # outer corner of the grid
-    size = np.ceil((mesh.bounds[1] - lowest) / spacing_mm).astype(int) + _MARGIN
+    grid = empty_grid(mesh.bounds, spacing_mm)
+    return grid.with_data(hu_to_attenuation(torch.tensor(float(hu)), -1000.0) * mesh_share(mesh, grid))
+
+
+def empty_grid(bounds: np.ndarray, spacing_mm: float) -> Volume:
+    """Zeros on cubic voxels around `bounds` (2, 3), the lowest and the highest corner in mm, with a margin."""
+    lowest = bounds[0] - _MARGIN * spacing_mm  # outer corner of the grid
+    size = np.ceil((bounds[1] - lowest) / spacing_mm).astype(int) + _MARGIN
+    x, y, z = (lowest + 0.5 * spacing_mm).tolist()
+    return Volume(torch.zeros(*size[::-1].tolist()), axis_aligned((spacing_mm, spacing_mm, spacing_mm), (x, y, z)))
+
+
+def mesh_share(mesh: trimesh.Trimesh, grid: Volume) -> torch.Tensor:
+    """The fraction of each voxel of a grid (Z, Y, X) along the axes of the mesh that lies inside the closed mesh."""
+    lowest = (grid.lps_from_index[:3, 3] - 0.5 * grid.lps_from_index[:3, :3].sum(1)).numpy()
     # the tiny shift keeps vertices and edges of CAD with round numbers off the columns, where they would count twice
     nudge = np.array([1.37e-5, 2.11e-5, 0.0])
-    coverage = np.zeros((size[2] + 1, size[1], size[0]))
-    _accumulate((mesh.triangles - lowest) / spacing_mm + nudge, coverage)
+    depth, rows, columns = grid.data.shape
+    coverage = np.zeros((depth + 1, rows, columns))
+    _accumulate((mesh.triangles - lowest) / np.array(grid.spacing_mm) + nudge, coverage)
     inside = np.cumsum(coverage, axis=0)[:-1].clip(0, 1).round(6)  # outside is exactly 0, inside exactly 1
-    attenuation = hu_to_attenuation(torch.tensor(float(hu)), -1000.0) * torch.from_numpy(inside).float()
-    x, y, z = (lowest + 0.5 * spacing_mm).tolist()
-    return Volume(attenuation, axis_aligned((spacing_mm, spacing_mm, spacing_mm), (x, y, z)))
+    return torch.from_numpy(inside).float()

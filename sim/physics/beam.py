@@ -1,5 +1,7 @@
 """The open beam on the detector: 1 where the central ray meets it, less towards the edges, none past a collimator."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -37,8 +39,23 @@ def circular_collimator(camera: Camera, radius_mm: float) -> Tensor:
     return ((radius_mm - distance) / _PENUMBRA_MM + 0.5).clamp(0, 1)
 
 
+def shutter(camera: Camera, width_mm: float, height_mm: float, turn_deg: float) -> Tensor:
+    """Share (H, W) of the focal spot that is seen past a rectangular opening about the central ray.
+
+    Width and height are those on the detector before it is turned by `turn_deg`, from columns to rows. The penumbra is
+    that of `circular_collimator`; shutters that turn: Bushberg et al., The Essential Physics of Medical Imaging, 3rd
+    ed. 2012, chapter 9.
+    """
+    x, y = camera.pixel_positions(torch.float32)[..., :2].unbind(-1)
+    cos, sin = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    share = torch.ones(camera.shape)
+    for size, along in zip((width_mm, height_mm), (x * cos + y * sin, y * cos - x * sin), strict=True):
+        share *= ((size / 2 - along.abs()) / _PENUMBRA_MM + 0.5).clamp(0, 1)
+    return share
+
+
 def open_beam(camera: Camera, falls_off: bool, heel_loss: float, collimator_mm: float) -> Tensor:
-    """The product (H, W) of all of these; `collimator_mm` of 0 is an open collimator."""
+    """The beam (H, W) without a shutter: the product of the above; `collimator_mm` of 0 is an open collimator."""
     field = inverse_square(camera) if falls_off else torch.ones(camera.shape)
     if heel_loss:
         field = field * heel(camera, heel_loss)

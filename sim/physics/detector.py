@@ -1,4 +1,7 @@
-"""The flat panel: from energy that falls on it, in units of the open beam, to raw 16-bit counts."""
+"""The detector: from energy that falls on it, in units of the open beam, to raw 16-bit counts.
+
+A flat panel, or an image intensifier, which spreads and loses light besides.
+"""
 
 import math
 
@@ -7,23 +10,50 @@ import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.geometry import Camera
 
 _FULL_SCALE = 65535
 _PATTERN_SEED = 20_200_101  # of the gain pattern: every image of a detector shows the same one
 
 
-def record_quanta(
-    energy: Tensor, photons: float, blur_sigma_px: float, electronic_noise: float, generator: torch.Generator
-) -> Tensor:
-    """Photons (H, W) that are read out where `photons` would fall on a pixel of the open beam.
+def record_quanta(energy: Tensor, photons: float, blur_sigma_px: float, generator: torch.Generator) -> Tensor:
+    """Photons (H, W) that are recorded where `photons` would fall on a pixel of the open beam.
 
-    Quanta are Poisson, are spread by the scintillator (so their noise is correlated), then electronic noise of this
-    standard deviation, in photons, is added.
+    Quanta are Poisson and are spread by the scintillator, so their noise is correlated.
     """
     quanta = torch.poisson((energy * photons).to(torch.float32), generator=generator)
-    signal = blur(quanta, blur_sigma_px)
-    signal += electronic_noise * torch.randn(signal.shape, generator=generator)
-    return signal
+    return blur(quanta, blur_sigma_px)
+
+
+def veiling_glare(light: Tensor, camera: Camera, share: float, width_mm: float) -> Tensor:
+    """Light (H, W) of an image intensifier, a share of which is spread widely over its output.
+
+    The spread is share · exp(−r / width) / (2π · width · r), with a long tail (Seibert, Nalcioglu, Roeck, Med Phys 11
+    (1984) 172, and 12 (1985) 281); its transform is share / √(1 + (2π · width · frequency)²). It keeps all light but
+    what is spread past the edges of the detector, beyond which nothing is lit.
+    """
+    coarse = max(1, round(width_mm / camera.pixel_mm[0] / 8))  # the tail is smooth: 8 samples to its width
+    small = F.avg_pool2d(light[None, None], coarse, ceil_mode=True)[0, 0]
+    size = [2 * n for n in small.shape]  # so that nothing comes back around the other side
+    rows, columns = (torch.fft.fftfreq(n, spacing * coarse) for n, spacing in zip(size, camera.pixel_mm, strict=True))
+    columns = columns[: size[1] // 2 + 1].abs()
+    transfer = 1 / (1 + (2 * math.pi * width_mm) ** 2 * (rows[:, None] ** 2 + columns**2)).sqrt()
+    spread = torch.fft.irfft2(torch.fft.rfft2(small, s=size) * transfer, s=size)[: small.shape[0], : small.shape[1]]
+    padded = [n * coarse for n in small.shape]
+    wide = F.interpolate(spread[None, None], size=padded, mode="bilinear", align_corners=False)[0, 0]
+    return (1 - share) * light + share * wide[: light.shape[0], : light.shape[1]]
+
+
+def vignetting(camera: Camera, loss: float) -> Tensor:
+    """Share (H, W) of the light that optics pass on: all in the middle, less by `loss` at the middle of the edges.
+
+    It falls with the square of the distance, which are the first terms of the cos⁴ law (Bushberg et al., The Essential
+    Physics of Medical Imaging, 3rd ed. 2012, chapter 9: vignetting).
+    """
+    distance = camera.pixel_positions(torch.float32)[..., :2].norm(dim=-1)
+    return (1 - loss * (distance / (camera.shape[1] * camera.pixel_mm[1] / 2)) ** 2).clamp_min(0)
 
 
 def digitise(signal: Tensor, counts_per_photon: float) -> Tensor:

@@ -1,8 +1,8 @@
 """Simulated fluoroscopy: from areal densities of soft tissue, bone and metal to raw 16-bit images.
 
 The chain of one image: polychromatic Beer–Lambert, fall-off of the beam, scatter, motion, quantum noise, blur of the
-scintillator, electronic noise, gain, digitisation. Every strength is a field of `XrayModel`; the values of the paper's
-preset stand in `configs/simulation/`.
+scintillator, glare and vignetting of an image intensifier, electronic noise, gain, digitisation. Every strength is a
+field of `XrayModel`; the values of the paper's preset stand in `configs/simulation/`.
 """
 
 import math
@@ -14,10 +14,12 @@ from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.geometry import Camera
-from sim.physics.beam import open_beam
-from sim.physics.detector import digitise, gain_pattern, motion_blur, record_quanta
-from sim.physics.materials import mass_attenuation
+from femoreg_torch.volume.materials import mass_attenuation
+from sim.physics.beam import open_beam, shutter
+from sim.physics.detector import digitise, gain_pattern, motion_blur, record_quanta, veiling_glare, vignetting
 from sim.physics.spectrum import fluence, tungsten_spectrum
+
+_ROWS = 32  # of an image at a time, which stay in the processor's cache for all energies
 
 
 @dataclass(frozen=True)
@@ -40,22 +42,30 @@ class XrayModel:
     electronic_noise: float  # standard deviation, in photons per mm of a pixel's width
     gain_spread: float  # standard deviation of the pixels' gain after flat-field correction
     open_beam_counts: float  # digital value of the open beam
+    shutter_width_mm: float = 0.0  # of a rectangular opening, on the detector; 0 is open
+    shutter_height_mm: float = 0.0
+    shutter_deg: float = 0.0  # by which it is turned, from columns to rows
+    glare: float = 0.0  # share of the light that is spread widely
+    glare_mm: float = 0.0  # how wide, on the detector
+    vignetting: float = 0.0  # share of the light lost at the middle of the detector's edges
 
 
 def transmission(areal: Mapping[str, Tensor], model: XrayModel) -> Tensor:
     """Share (H, W) of the open beam's energy that reaches each pixel: Beer–Lambert per energy, weighted by the energy.
 
-    `areal` maps material names (`sim.physics.materials`) to mass per area (H, W) in g/cm².
+    `areal` maps material names (`femoreg_torch.volume.materials`) to mass per area (H, W) in g/cm².
     """
     energies, photons = tungsten_spectrum(model.kvp, model.aluminium_mm, model.energy_bins, model.k_lines)
     weights = photons * energies / (photons * energies).sum()
     coefficients = {name: mass_attenuation(name, energies).tolist() for name in areal}
     image = torch.zeros_like(next(iter(areal.values())))
-    for i, weight in enumerate(weights.tolist()):
-        exponent = torch.zeros_like(image)
-        for name, mass in areal.items():
-            exponent.sub_(mass, alpha=coefficients[name][i])
-        image.add_(exponent.exp_(), alpha=weight)
+    for start in range(0, len(image), _ROWS):
+        rows = slice(start, start + _ROWS)
+        for i, weight in enumerate(weights.tolist()):
+            exponent = torch.zeros_like(image[rows])
+            for name, mass in areal.items():
+                exponent.sub_(mass[rows], alpha=coefficients[name][i])
+            image[rows].add_(exponent.exp_(), alpha=weight)
     return image
 
 
@@ -89,8 +99,12 @@ def detect(energy: Tensor, model: XrayModel, camera: Camera, generator: torch.Ge
         length, angle = torch.rand(2, generator=generator).tolist()
         energy = motion_blur(energy, length * model.motion_mm / camera.pixel_mm[1], math.pi * angle)
     photons = photons_per_pixel(model, camera)
-    noise = model.electronic_noise * camera.pixel_mm[1]
-    signal = record_quanta(energy, photons, model.blur_sigma_mm / camera.pixel_mm[1], noise, generator)
+    signal = record_quanta(energy, photons, model.blur_sigma_mm / camera.pixel_mm[1], generator)
+    if model.glare:
+        signal = veiling_glare(signal, camera, model.glare, model.glare_mm)
+    if model.vignetting:
+        signal *= vignetting(camera, model.vignetting)
+    signal += model.electronic_noise * camera.pixel_mm[1] * torch.randn(signal.shape, generator=generator)
     if model.gain_spread:
         signal *= gain_pattern(camera.shape, model.gain_spread)
     return digitise(signal, model.open_beam_counts / photons)
@@ -100,4 +114,6 @@ def fluoroscopy(areal: Mapping[str, Tensor], camera: Camera, model: XrayModel, g
     """Raw fluoroscopic image (H, W) uint16 behind the given mass per area (H, W) in g/cm² of each material."""
     primary = transmission(areal, model)
     beam = open_beam(camera, model.inverse_square, model.heel, model.collimator_mm)
+    if model.shutter_width_mm and model.shutter_height_mm:
+        beam = beam * shutter(camera, model.shutter_width_mm, model.shutter_height_mm, model.shutter_deg)
     return detect(beam * primary + scattered(primary, model, camera, beam), model, camera, generator)

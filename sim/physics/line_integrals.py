@@ -1,7 +1,7 @@
 """Line integrals of density along the rays: mass per area of every material."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 import trimesh
@@ -11,10 +11,19 @@ from torch.nn import functional as F
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera
 from femoreg_torch.volume import Volume, hu_to_attenuation, voxelise_mesh
+from femoreg_torch.volume.materials import DENSITIES
 from sim.physics.materials import WATER_PER_BONE, metal_density
 
 _PIXEL_PER_VOXEL = 0.6  # mm on the detector; a voxel's shadow there is some 1.35 times as wide as the voxel
 _ASIDE = 2  # coarse pixels to each side that cubic interpolation needs
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """Something in the beam that is no patient: its material (`femoreg_torch.volume.materials`) and its density."""
+
+    material: str
+    density: Volume  # g/cm³
 
 
 def areal_densities(
@@ -69,6 +78,36 @@ def _interpolated(volumes: Sequence[Volume], camera_from_volume: Tensor, camera:
 
 def device_density(mesh: trimesh.Trimesh, spacing_mm: float, hu: float) -> Volume:
     """Density in g/cm³ of a device of titanium that a CT would show at `hu`, in CAD space."""
+    return _filled(mesh, spacing_mm, hu, metal_density(hu))
+
+
+def solid_of(mesh: trimesh.Trimesh, material: str, spacing_mm: float) -> Solid:
+    """A closed mesh (mm) full of a material at its own density."""
+    return Solid(material, _filled(mesh, spacing_mm, 1000.0, DENSITIES[material]))
+
+
+def _filled(mesh: trimesh.Trimesh, spacing_mm: float, hu: float, density: float) -> Volume:
+    """`density` where the mesh is; the HU are those that its share of each voxel is computed with."""
     solid = voxelise_mesh(mesh, spacing_mm, hu)
     full = hu_to_attenuation(torch.tensor(float(hu)), -1000.0)
-    return solid.with_data(solid.data / full * metal_density(hu))
+    return solid.with_data(solid.data / full * density)
+
+
+def areal_solids(
+    solids: Sequence[Solid], camera_from_solids: Tensor, camera: Camera, step_mm: float
+) -> dict[str, Tensor]:
+    """Mass per area (H, W) in g/cm² of each material of solids that share one frame; pose (4, 4)."""
+    if not solids:
+        return {}
+    numbered = {str(number): solid.density for number, solid in enumerate(solids)}
+    images = areal_densities(numbered, camera_from_solids, camera, step_mm).values()
+    return together(*({solid.material: image} for solid, image in zip(solids, images, strict=True)))
+
+
+def together(*areal: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Mass per area of several things in one beam: those of one material add up."""
+    total: dict[str, Tensor] = {}
+    for masses in areal:
+        for material, mass in masses.items():
+            total[material] = total[material] + mass if material in total else mass
+    return total

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from sim.physics.materials import HIGHEST_KEV, LOWEST_KEV, mass_attenuation
+from femoreg_torch.volume.materials import HIGHEST_KEV, LOWEST_KEV, mass_attenuation
 
 _ALUMINIUM_DENSITY = 2.699  # g/cm³
 
@@ -30,7 +30,7 @@ def tungsten_spectrum(kvp: float, aluminium_mm: float, bins: int, k_lines: float
     Cosslett 1968, in International Tables for Crystallography C, 4.2.1.1.1); at twice the edge there are `k_lines` of
     them per photon of bremsstrahlung above 15 keV. All behind an aluminium filter. With 0.06 the lines' share is that
     of SpekPy 2.5.4 (anode of 10°, 4 mm of aluminium) within a sixth of it at 75 kV and a tenth from 80 to 100 kV.
-    Raises `InputError` for a voltage beyond the tables of `sim.physics.materials`.
+    Raises `InputError` for a voltage beyond the tables of `femoreg_torch.volume.materials`.
     """
     if not LOWEST_KEV < kvp <= HIGHEST_KEV:
         raise InputError(f"kvp: a tube voltage between 15 and 100 kV was expected, got {kvp:g}.")

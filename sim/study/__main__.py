@@ -14,6 +14,7 @@ from sim.study import ablation as variants
 from sim.study import accuracy as measurement
 from sim.study import capture
 from sim.study.cases import Stores, ready
+from sim.study.conditions import Imaged, make_conditions, read_conditions
 from sim.study.procedures import Procedure, Study, load_study, procedures
 from sim.study.timing import time_register
 from sim.study.trust import sabotaged_runs, write_trust
@@ -172,6 +173,33 @@ def ablation(
     print(variants.write_ablation(rows, len(chosen), variants_file, docs))
 
 
+def conditions(
+    conditions_file: str = "conditions",
+    only: str | None = None,
+    first: int | None = None,
+    kind: Kind = "all",
+    out: Path = _OUT,
+    patients: Path | None = None,
+    data: Path = _DATA,
+    jobs: int = 1,
+) -> None:
+    """Image the procedures under other conditions: OUT/conditions/CONDITION/PROCEDURE; those that are there stay.
+
+    Args:
+        conditions_file: preset of configs/study, or a YAML file of conditions.
+        only: names of conditions, with commas in between; all, if not given.
+        first: only the first so many procedures.
+        kind: patients to take.
+        out: folder that holds, or will hold, `conditions/`, and `bodies/`, which later conditions reuse.
+        patients: CTs around real bone shapes; OUT/patients if not given.
+        data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
+        jobs: procedures at the same time, on one core each; each needs some gigabytes of memory.
+    """
+    study, chosen, stores = _chosen(first, kind, out, patients, data)
+    wanted = read_conditions(conditions_file, only.split(",") if only else ())
+    make_conditions(chosen, wanted, study, stores, Imaged(out / "bodies", out / "conditions"), jobs)
+
+
 def listing(first: int | None = None, kind: Kind = "all", out: Path = _OUT) -> None:
     """Which procedures the study has, and which of their cases are there.
 
@@ -201,6 +229,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "capture-range": capture_range,
         "trust": trust,
         "ablation": ablation,
+        "conditions": conditions,
         "list": listing,
     }
     try:

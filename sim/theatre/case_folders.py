@@ -17,10 +17,11 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import write_image
 from femoreg_torch.volume import Volume, label_box_centre, read_ct, read_labels, read_mesh
 from sim.patient import Patient, make_patient, make_scans, write_patient
-from sim.theatre.images import simulate_images
+from sim.theatre.images import ViewImages, simulate_images
+from sim.theatre.metal import metal_in_beam
 from sim.theatre.preoperative_case import Preoperative, read_preoperative
 from sim.theatre.preview import write_preview
-from sim.theatre.procedure import draw_procedure
+from sim.theatre.procedure import Procedure, draw_procedure
 from sim.theatre.settings import load_simulation
 
 SIMULATION_STEPS = 6  # reports of `write_simulation`: poses, femur, three views, writing
@@ -29,10 +30,11 @@ _SAME_MM = 2.0  # two scans of one patient agree within a voxel or two
 
 def write_phantom(out: Path, seed: int, side: Side, spacing_mm: float) -> None:
     """Write the procedural patient of this seed as a case without images: CT, labels, landmarks, plan and device."""
-    _write_patient(make_patient(seed, spacing_mm), out, seed, side)
+    write_patient_case(make_patient(seed, spacing_mm), out, seed, side)
 
 
-def _write_patient(patient: Patient, out: Path, seed: int, side: Side) -> None:
+def write_patient_case(patient: Patient, out: Path, seed: int, side: Side) -> None:
+    """Write a patient as a case without images, with a plan for this side and the device of this seed."""
     with new_folder(out) as folder:
         write_patient(folder, patient)
         known = read_preoperative(folder, side, seed, load_simulation("paper"), folder / "device.stl")
@@ -57,7 +59,7 @@ def write_simulation(
     """
     known = read_case(patient).side if side is None and (patient / "case.yaml").is_file() else side
     scan = None if finer is None else partial(_read_pair, finer)
-    _write_simulation(patient, out, seed, known or "left", config, report, scan)
+    _write_simulation(patient, out, seed, known or "left", config, report, scan, seed)
 
 
 def write_procedural_simulation(
@@ -77,8 +79,8 @@ def write_procedural_simulation(
     held, imaged = make_scans(patient_seed, spacings_mm)
     with tempfile.TemporaryDirectory() as parent:
         patient = Path(parent) / "patient"
-        _write_patient(held, patient, patient_seed, side)
-        _write_simulation(patient, out, seed, side, config, report, lambda: (imaged.ct, imaged.labels))
+        write_patient_case(held, patient, patient_seed, side)
+        _write_simulation(patient, out, seed, side, config, report, lambda: (imaged.ct, imaged.labels), patient_seed)
 
 
 def _read_pair(folder: Path) -> tuple[Volume, Volume]:
@@ -94,26 +96,27 @@ def _write_simulation(
     config: str,
     report: Callable[[str], None],
     imaged: Callable[[], tuple[Volume, Volume]] | None,
+    device_seed: int,
 ) -> None:
     settings = load_simulation(config)
     generator = torch.Generator().manual_seed(seed)
     with new_folder(out) as folder:
         report("drawing the poses")
-        known = _copied(read_preoperative(patient, side, seed, settings, folder / "device.stl"), folder)
+        known = copied(read_preoperative(patient, side, seed, settings, folder / "device.stl"), folder)
         mesh = read_mesh(known.device.model.path)
         procedure = draw_procedure(known, mesh, settings.acquisition, generator)
         ct = read_ct(known.ct_path)
         labels = read_labels(known.labels_path, ct)
         if imaged is not None:
             finer_ct, finer_labels = imaged()
-            _check_same_patient(labels, finer_labels, known.femur)
+            check_same_patient(labels, finer_labels, known.femur)
             ct, labels = finer_ct, finer_labels
         images = simulate_images(
             ct,
             labels,
             known.femur,
             known.head,
-            mesh,
+            metal_in_beam(mesh, device_seed, settings.acquisition),
             procedure,
             known.case.carm.camera,
             settings.acquisition,
@@ -122,20 +125,25 @@ def _write_simulation(
             report,
         )
         report("writing")
-        views = []
-        for number, view in enumerate(images, 1):
-            paths = {
-                ANATOMY_IMAGES: folder / f"view{number}.tif",
-                DEVICE_IMAGES: folder / f"view{number}_device.tif",
-            }
-            write_image(paths[ANATOMY_IMAGES], view.anatomy)
-            write_image(paths[DEVICE_IMAGES], view.device)
-            views.append(View(paths))
-        write_preview(folder / "preview.png", images)
-        write_case(folder, replace(known.case, views=tuple(views), truth=procedure.truth))
+        write_images_and_case(folder, known, images, procedure)
 
 
-def _check_same_patient(labels: Volume, finer: Volume, femur: tuple[int, ...]) -> None:
+def write_images_and_case(folder: Path, known: Preoperative, images: list[ViewImages], procedure: Procedure) -> None:
+    """Write the images of a procedure, a preview of them, and the case with its truth into its folder."""
+    views = []
+    for number, view in enumerate(images, 1):
+        paths = {
+            ANATOMY_IMAGES: folder / f"view{number}.tif",
+            DEVICE_IMAGES: folder / f"view{number}_device.tif",
+        }
+        write_image(paths[ANATOMY_IMAGES], view.anatomy)
+        write_image(paths[DEVICE_IMAGES], view.device)
+        views.append(View(paths))
+    write_preview(folder / "preview.png", images)
+    write_case(folder, replace(known.case, views=tuple(views), truth=procedure.truth))
+
+
+def check_same_patient(labels: Volume, finer: Volume, femur: tuple[int, ...]) -> None:
     """Raises `InputError` unless both label maps have the femur in the same place."""
     apart = (label_box_centre(labels, femur) - label_box_centre(finer, femur)).norm().item()
     if apart > _SAME_MM:
@@ -145,7 +153,7 @@ def _check_same_patient(labels: Volume, finer: Volume, femur: tuple[int, ...]) -
         )
 
 
-def _copied(known: Preoperative, folder: Path) -> Preoperative:
+def copied(known: Preoperative, folder: Path) -> Preoperative:
     """The same with its volumes and its device in `folder`; volumes are linked where the file system can."""
     ct_path, labels_path = (_linked(path, folder) for path in (known.ct_path, known.labels_path))
     model_path = folder / f"device{known.device.model.path.suffix}"

@@ -1,18 +1,18 @@
 """The six images of one procedure: every view without and with the device."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
-import trimesh
 from torch import Tensor
 
-from femoreg_torch.geometry import Camera
+from femoreg_torch.geometry import Camera, invert_rigid
 from femoreg_torch.volume import Volume
 from sim.physics.fluoroscopy import XrayModel, fluoroscopy
-from sim.physics.line_integrals import areal_densities, device_density
+from sim.physics.line_integrals import areal_solids, together
 from sim.theatre.field_of_view import field_of_view
-from sim.theatre.posed_tissue import areal_posed_tissue, take_apart
+from sim.theatre.metal import Metal
+from sim.theatre.posed_tissue import PosedTissue, areal_posed_tissue, take_apart
 from sim.theatre.procedure import Procedure
 from sim.theatre.settings import Acquisition
 
@@ -32,7 +32,7 @@ def simulate_images(
     labels: Volume,
     femur: tuple[int, ...],
     head_centre: Tensor,
-    mesh: trimesh.Trimesh,
+    metal: Metal,
     procedure: Procedure,
     camera: Camera,
     settings: Acquisition,
@@ -43,19 +43,52 @@ def simulate_images(
     """Images of all views of a procedure; `report` is told each step before it starts.
 
     `ct` is in HU, `labels` on the same grid; `femur` holds the ids of the operated femur and `head_centre` (3,) is
-    its head in LPS mm; `mesh` is the device in CAD mm.
+    its head in LPS mm.
+    """
+    report("turning the femur")
+    tissue = posed_tissue(ct, labels, femur, head_centre, procedure, camera)
+    del ct, labels
+
+    def body(pose: Tensor) -> dict[str, Tensor]:
+        return areal_posed_tissue(tissue, pose, camera, settings.step_mm)
+
+    return view_images(body, metal, procedure, camera, settings.step_mm, model, generator, report)
+
+
+def posed_tissue(
+    ct: Volume, labels: Volume, femur: tuple[int, ...], head_centre: Tensor, procedure: Procedure, camera: Camera
+) -> PosedTissue:
+    """The part of a patient that the views of a procedure show, after the femur has turned; see `simulate_images`."""
+    poses = procedure.camera_from_pelvis
+    ct, labels = (field_of_view(volume, poses, camera, _ROOM_MM) for volume in (ct, labels))
+    return take_apart(ct, labels, femur, procedure.femur_rotation, head_centre)
+
+
+def view_images(
+    body: Callable[[Tensor], Mapping[str, Tensor]],
+    metal: Metal,
+    procedure: Procedure,
+    camera: Camera,
+    step_mm: float,
+    model: XrayModel,
+    generator: torch.Generator,
+    report: Callable[[str], None],
+) -> list[ViewImages]:
+    """Images of all views of a procedure.
+
+    `body` tells the patient's mass per area (H, W) in g/cm² of each material, seen from a pose `camera_from_lps`
+    (4, 4). `report` is told each view before it starts.
     """
     poses = procedure.camera_from_pelvis
-    report("turning the femur")
-    ct, labels = (field_of_view(volume, poses, camera, _ROOM_MM) for volume in (ct, labels))
-    tissue = take_apart(ct, labels, femur, procedure.femur_rotation, head_centre)
-    del ct, labels
-    metal = device_density(mesh, settings.step_mm, settings.device_hu)
+    camera_from_camera1 = poses @ invert_rigid(poses[0])
     views = []
-    for number, (pose, device_pose) in enumerate(zip(poses, procedure.camera_from_device, strict=True), 1):
-        report(f"imaging view {number} of {len(poses)}")
-        body = areal_posed_tissue(tissue, pose, camera, settings.step_mm)
-        device = areal_densities({"titanium": metal}, device_pose, camera, settings.step_mm)
-        anatomy_image = fluoroscopy(body, camera, model, generator)
-        views.append(ViewImages(anatomy_image, fluoroscopy(body | device, camera, model, generator)))
+    for number, pose in enumerate(poses):
+        report(f"imaging view {number + 1} of {len(poses)}")
+        table = areal_solids(metal.table, camera_from_camera1[number], camera, step_mm)
+        device = areal_solids(metal.device, procedure.camera_from_device[number], camera, step_mm)
+        still = body(pose)
+        later = still if procedure.lps_moved is None else body(pose @ procedure.lps_moved)
+        anatomy_image = fluoroscopy(together(still, table), camera, model, generator)
+        device_image = fluoroscopy(together(later, table, device), camera, model, generator)
+        views.append(ViewImages(anatomy_image, device_image))
     return views

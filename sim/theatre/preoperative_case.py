@@ -123,9 +123,15 @@ def _write_device(seed: int, path: Path) -> Device:
 
 
 def _at_nominal_pose(device: Device, path: PlannedPath, head: Tensor, side: Side, settings: Simulation) -> Device:
-    """The device at its nominal pose, of the material that the settings say."""
+    """The device at its nominal pose, of the material that the settings say. Raises `InputError` if it has parts."""
+    if device.model.parts:
+        raise InputError(
+            f"{device.model.path.parent}: the device has parts, but a simulation images one mesh. Give `model` with a "
+            "mesh of the whole device and its `hu`."
+        )
     ap = nominal_ap(head, side, settings.acquisition)
     path_camera = ap[:3, :3] @ (path.target - path.entry_point)
     mesh = read_mesh(device.model.path)
     pose = nominal_device(mesh, device.points, path_camera, settings.acquisition.device_depth_mm)
-    return replace(device, model=replace(device.model, hu=settings.acquisition.device_hu), camera1_from_device=pose)
+    model = replace(device.model, hu=settings.acquisition.device_hu, material=None)
+    return replace(device, model=model, camera1_from_device=pose)

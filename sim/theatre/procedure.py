@@ -1,14 +1,25 @@
 """The paper's acquisition (section III-A) as poses: from the nominal AP view, everything that moves at random."""
 
+import math
 from dataclasses import dataclass
 
 import torch
 import trimesh
 from torch import Tensor
+from torch.nn import functional as F
 
 from femoreg_torch.case.femoroplasty import DEVICE, FEMUR, PELVIS
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import CArm, Poses, about_point, invert_rigid, project_points, transform_points
+from femoreg_torch.geometry import (
+    CArm,
+    Poses,
+    about_point,
+    exp_so3,
+    invert_rigid,
+    project_points,
+    rigid,
+    transform_points,
+)
 from femoreg_torch.geometry.poses import poses_by_object
 from sim.theatre.nominal_poses import nominal_ap
 from sim.theatre.preoperative_case import Preoperative
@@ -25,6 +36,7 @@ class Procedure:
     camera1_from_femur: Tensor  # (4, 4)
     camera_from_device: Tensor  # (V, 4, 4)
     femur_rotation: Tensor  # (3, 3), in LPS about the femoral head centre
+    lps_moved: Tensor | None = None  # (4, 4): how the patient has moved before the images with the device
 
     @property
     def truth(self) -> Poses:
@@ -57,7 +69,8 @@ def draw_procedure(
     for _ in range(_TRIES):
         camera_from_device = camera_from_camera1 @ about_point(settings.device.draw(generator), centre) @ nominal
         if _inside(mesh, camera_from_device, carm, settings.device_margin_mm):
-            return Procedure(camera_from_pelvis, camera1_from_femur, camera_from_device, femur_motion[:3, :3])
+            moved = _draw_move(known.head, settings, generator)
+            return Procedure(camera_from_pelvis, camera1_from_femur, camera_from_device, femur_motion[:3, :3], moved)
     raise InputError(
         f"simulation: the device never lies inside all images at {settings.device_depth_mm:g} mm from the source. "
         "Increase `device_depth_mm` or use a smaller device."
@@ -72,6 +85,15 @@ def _draw_stops(carm: CArm, settings: Acquisition, generator: torch.Generator) -
         angle = torch.deg2rad(mean + std * torch.randn((), generator=generator, dtype=torch.float64))
         stops.append(about_point(settings.view.draw(generator), isocentre) @ carm.orbit(angle))
     return stops
+
+
+def _draw_move(head: Tensor, settings: Acquisition, generator: torch.Generator) -> Tensor | None:
+    """A turn about the femoral head and a shift (4, 4) of just the sizes that the settings say, if any."""
+    if not (settings.moved_deg or settings.moved_mm):
+        return None
+    axis, direction = F.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=1)
+    turn = exp_so3(math.radians(settings.moved_deg) * axis)
+    return about_point(rigid(turn, settings.moved_mm * direction), head)
 
 
 def _inside(mesh: trimesh.Trimesh, camera_from_device: Tensor, carm: CArm, margin_mm: float) -> bool:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from femoreg_torch.configs import load_preset
@@ -44,6 +45,10 @@ class Acquisition:
     device_depth_mm: float
     device_margin_mm: float
     step_mm: float
+    device_materials: Literal["titanium", "mixed"] = "titanium"
+    table_parts: bool = False
+    moved_deg: float = 0.0
+    moved_mm: float = 0.0
 
 
 @dataclass(frozen=True)

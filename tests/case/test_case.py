@@ -14,7 +14,7 @@ from femoreg_torch.anatomy import HIP, label_table
 from femoreg_torch.case import Case, Model, PlannedPath, View, read_case, write_case, write_json
 from femoreg_torch.case.femoroplasty import Device, device_of, femoroplasty_objects, planned, with_device
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import CArm, centred_camera, exp_se3, load_carm, poses_by_object
+from femoreg_torch.geometry import CArm, Uncertainty, centred_camera, exp_se3, load_carm, poses_by_object
 
 FILES = ("ct.nii.gz", "labels.nii.gz", "device.stl", "view1.tif", "view1_device.tif", "view2.tif")
 
@@ -82,7 +82,8 @@ def test_a_written_case_comes_back(tmp_path: Path) -> None:
 
 
 def test_a_case_without_what_is_optional_comes_back(tmp_path: Path) -> None:
-    carm = CArm(centred_camera(1000.0, (0.3, 0.4), (800, 900)), (0.0, 1.0, 600.0), (0.0, 1.0, 0.0))
+    camera = centred_camera(1000.0, (0.3, 0.4), (800, 900))
+    carm = CArm(camera, (0.0, 1.0, 600.0), (0.0, 1.0, 0.0), Uncertainty(0.5, 1.0))
     target = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     whole = example(tmp_path)
     case = replace(

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from femoreg_torch.case import (
+    CameraQuality,
     LandmarkRecord,
     ObjectQuality,
     Result,
@@ -22,7 +23,7 @@ from femoreg_torch.case import (
 )
 from femoreg_torch.case.trace import Moment, Restart
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import exp_se3, poses_by_object
+from femoreg_torch.geometry import CameraChange, exp_se3, poses_by_object
 
 
 def pose(seed: int) -> torch.Tensor:
@@ -188,4 +189,37 @@ def test_bad_results(tmp_path: Path, change: dict[str, Any], message: str) -> No
     content = written(tmp_path, example())
     write_json(tmp_path / "result.json", content | change)
     with pytest.raises(InputError, match=message):
+        read_result(tmp_path)
+
+
+def test_refined_cameras_come_back(tmp_path: Path) -> None:
+    result = example()
+    changes = (CameraChange(0.97, (1.0, -2.0)), CameraChange(0.97, (0.5, 0.25)))
+    (stage,) = result.stages
+    refined = replace(stage, poses=stage.poses.with_changes(changes))
+    cameras = (
+        CameraQuality(990.0, (767.5, 700.0), 2.0, (3.0, 4.0)),
+        CameraQuality(990.0, (760.0, 701.0), 2.0, (3.0, 4.0)),
+    )
+    doubts = ("the images fit a source distance of 940 mm",)
+    given = replace(
+        result, poses=refined.poses, cameras=cameras, stages=(stage, refined), doubts=doubts
+    )  # fmt: skip
+    content = written(tmp_path, given)
+    assert content["carm_refined"][0]["sdd_mm"] == 990.0
+    assert content["carm_refined"][1]["principal_point_deviation_px"] == [3.0, 4.0]
+    found = read_result(tmp_path)
+    assert found.poses.changes == changes
+    assert found.cameras == cameras
+    assert [s.poses.changes for s in found.stages] == [(), changes]
+    assert found.doubts == doubts
+    assert found.verdict == given.verdict
+    assert not found.verdict.trusted
+
+
+def test_cameras_of_another_number_of_views_are_refused(tmp_path: Path) -> None:
+    content = written(tmp_path, example())
+    content["carm_refined"] = [{"sdd_factor": 1.0, "principal_point_shift_mm": [0, 0]}]
+    (tmp_path / "result.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="carm_refined: 2 views were expected"):
         read_result(tmp_path)

@@ -1,5 +1,7 @@
 """Derivatives with respect to pose and volume: finite differences of, and autograd through, the float64 march."""
 
+import math
+
 import pytest
 import torch
 from drr_scenes import (
@@ -19,7 +21,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from femoreg_torch.drr import project, project_with_jacobian
-from femoreg_torch.geometry import about_point, exp_se3
+from femoreg_torch.geometry import CameraChange, about_point, exp_se3
 from femoreg_torch.volume.grid import Volume
 
 SCALE = float64(0.02, 0.02, 0.02, 1, 1, 1)  # so that rotations and shifts weigh about the same
@@ -93,6 +95,23 @@ def test_jacobian_image_agrees_with_finite_differences_of_the_march(centre, came
         expected = (there - back)[:, 0] / (2 * step[dof])
         gap = (jacobian[..., dof].double() - expected).square().mean().sqrt() / expected.square().mean().sqrt()
         assert gap < 1e-3, f"degree of freedom {dof}"
+
+
+@pytest.mark.parametrize("camera", [CAMERA, DEVIATING_CAMERA], ids=["square", "off centre"])
+def test_derivatives_by_the_intrinsics_agree_with_finite_differences_of_the_march(camera):
+    volumes, poses, _, _ = scene()
+    volume, pose = volumes[0], poses[:, 0]
+    plain = project_with_jacobian(volume, pose, camera, float64(0, 0, 0))[1]
+    jacobian = project_with_jacobian(volume, pose, camera, float64(0, 0, 0), intrinsics=True)[1]
+    assert_close(jacobian[..., :6], plain)
+    h = 1e-6
+    steps = [(h, lambda s: CameraChange(math.exp(s)))]
+    steps += [(1e-5, lambda s: CameraChange(1.0, (s, 0.0))), (1e-5, lambda s: CameraChange(1.0, (0.0, s)))]
+    for n, (size, change) in enumerate(steps):
+        there, back = (truth([volume], pose[:, None], camera.changed(change(s))) for s in (size, -size))
+        expected = (there - back)[:, 0] / (2 * size)
+        gap = (jacobian[..., 6 + n].double() - expected).square().mean().sqrt() / expected.square().mean().sqrt()
+        assert gap < 2e-3, f"intrinsic {n}"
 
 
 def test_jacobian_image_agrees_with_the_gradient():

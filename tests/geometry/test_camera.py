@@ -9,7 +9,7 @@ import torch
 from torch.testing import assert_close
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import Camera, centred_camera, exp_se3, project_points, transform_points
+from femoreg_torch.geometry import Camera, CameraChange, centred_camera, exp_se3, project_points, transform_points
 
 CAMERA = Camera(1020.0, (0.3, 0.2), (120, 161), (71.25, 65.5))  # rows and columns of different size, off centre
 
@@ -99,3 +99,17 @@ def test_an_empty_window_is_refused(rows):
 def test_an_impossible_camera_is_refused(sdd, pixel, shape):
     with pytest.raises(InputError, match="positive"):
         centred_camera(sdd, pixel, shape)
+
+
+def test_a_changed_camera_and_its_coarser_grid_change_alike() -> None:
+    camera = centred_camera(1000.0, (0.2, 0.4), (100, 80))
+    change = CameraChange(1.03, (1.2, -0.6))
+    changed = camera.changed(change)
+    assert changed.sdd_mm == pytest.approx(1030)
+    assert changed.principal_point_px == pytest.approx((39.5 + 3.0, 49.5 - 3.0))
+    there, here = camera.downsampled(2).changed(change), changed.downsampled(2)
+    assert there.principal_point_px == pytest.approx(here.principal_point_px)
+    assert there.sdd_mm == here.sdd_mm
+    back = changed.changed(CameraChange(1 / 1.03, (-1.2, 0.6)))
+    assert back.principal_point_px == pytest.approx(camera.principal_point_px)
+    assert change.then(CameraChange(1.03, (0.0, 1.0))) == CameraChange(1.03**2, (1.2, 0.4))

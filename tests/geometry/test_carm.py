@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import carm_from_dict, invert_rigid, load_carm, orbit_angles, transform_points
+from femoreg_torch.geometry import Uncertainty, carm_from_dict, invert_rigid, load_carm, orbit_angles, transform_points
 
 GOOD = {"sdd_mm": 1000, "pixel_mm": [0.3, 0.2], "shape": [100, 200]}
 CARM = load_carm("cios_fusion")
@@ -72,6 +72,12 @@ def test_defaults_of_an_own_carm():
     assert own.camera.principal_point_px == (10.0, 20.0)
 
 
+def test_what_is_not_said_of_the_uncertainty_is_that_of_a_c_arm_nobody_has_calibrated():
+    assert carm_from_dict(GOOD, "mine").uncertainty == Uncertainty(2.0, 2.0)
+    said = carm_from_dict(GOOD | {"uncertainty": {"sdd_percent": 0}}, "mine").uncertainty
+    assert said == Uncertainty(sdd_percent=0.0, principal_point_mm=2.0)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -84,6 +90,10 @@ def test_defaults_of_an_own_carm():
         ({"isocentre_mm": 600}, "isocentre_mm"),
         ({"orbit_axis": [0, 0, 0]}, "orbit_axis"),
         ({"sdd_mm": -1}, "positive"),
+        ({"uncertainty": 2}, "uncertainty"),
+        ({"uncertainty": {"sdd": 2}}, "'sdd'"),
+        ({"uncertainty": {"sdd_percent": "some"}}, "uncertainty.sdd_percent"),
+        ({"uncertainty": {"principal_point_mm": -1}}, "must not be negative"),
     ],
 )
 def test_bad_settings_are_refused_with_place_and_key(change, words):

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from registration_scenes import REFERENCE_POINTS, error, float64, make_scene, off, true_poses
+from registration_scenes import REFERENCE_POINTS, error, float64, make_scene, off, quicker, true_poses
 
 from femoreg_torch.case import Start
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import invert_rigid, rigid
 from femoreg_torch.optimize import LevenbergMarquardt
-from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, Step, load_plan, run_plan
+from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, load_plan, run_plan
 from femoreg_torch.registration.covariance import pose_covariance
 from femoreg_torch.registration.stage import run_stage
 from femoreg_torch.similarity import GradNcc
@@ -89,26 +89,11 @@ def test_of_one_view_the_c_arm_stays_and_it_is_told() -> None:
 def test_a_search_for_the_views_without_its_images_is_refused() -> None:
     scene = make_scene(TRUTH, with_device=False)
     search = replace(ORBIT, kinds=["device"])
-    says = r"preset mine, step “orbit”: it finds the C-arm .* kind “device”. Choose another preset."
+    says = r"preset mine, step “orbit”: it finds the C-arm .* kind “device” in view 2. Choose another preset."
     with pytest.raises(InputError, match=says):
         run_plan(scene, Plan("mine", (search,)), TRUTH.camera1_from["pelvis"], 0)
     plan = Plan("mine", (search, stage("joint", "all", EACH)))
     assert len(run_plan(known(scene), plan, TRUTH.camera1_from["pelvis"], 0).skipped) == 1
-
-
-def quicker(plan: Plan) -> Plan:
-    """The same plan with a fifth of the random candidates, at most two starts, and 3 mm along the rays."""
-
-    def changed(step: Step) -> Step:
-        assert isinstance(step, Stage | OrbitSearch)
-        step = replace(step, level=replace(step.level, step_mm=3.0))
-        if isinstance(step, OrbitSearch):
-            return step
-        assert isinstance(step.optimiser, LevenbergMarquardt)
-        fewer = replace(step.optimiser, candidates=step.optimiser.candidates // 5, starts=min(step.optimiser.starts, 2))
-        return replace(step, optimiser=fewer)
-
-    return replace(plan, steps=tuple(changed(step) for step in plan.steps))
 
 
 @pytest.mark.parametrize("given", [True, False])

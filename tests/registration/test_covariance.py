@@ -48,7 +48,7 @@ def test_the_prediction_is_of_the_size_of_the_spread(solutions: tuple[list[Poses
         first = found[0].camera1_from[name][:3, :3]
         angles = torch.stack([log_so3(p.camera1_from[name][:3, :3] @ first.T) for p in found]).rad2deg()
         spread = torch.cat([angles.std(0), places.std(0)])
-        rotation, translation = covariance.deviations(name)
+        rotation, translation = covariance.by_images(name)
         ratio = torch.tensor([*rotation, *translation]) / spread
         # Five samples know a deviation to a third; depth varies with what else is fitted.
         assert 0.4 < ratio.log().mean().exp() < 2.5, (name, ratio)

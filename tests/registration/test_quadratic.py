@@ -7,8 +7,9 @@ import pytest
 import torch
 from registration_scenes import REFERENCE_POINTS, VOLUMES, float64, make_scene, off, segmentations, true_poses
 
+from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import PLAIN, Imaging, Prior, image_costs, stage_objective
+from femoreg_torch.registration.objective import Prior, image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, reference_point_in_view
 from femoreg_torch.registration.weights import Weighting
 from femoreg_torch.similarity import GradNcc, Ncc, Similarity

@@ -103,7 +103,7 @@ def test_a_result_that_is_not_trusted_ends_in_status_3_if_trust_is_required(demo
     assert result["trusted"] is False
     assert result["reasons"]
     assert main(["navigate", str(tmp_path / "run")]) == 0
-    assert json.loads((tmp_path / "run" / "navigation.json").read_text())["trusted"] is False
+    assert json.loads((tmp_path / "run" / "navigation.json").read_text(encoding="utf-8"))["trusted"] is False
 
 
 def test_a_registration_starts_where_a_file_says(

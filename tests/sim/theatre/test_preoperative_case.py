@@ -1,9 +1,13 @@
 """Planning on a femur of known shape, and folders that lack something."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from femoreg_torch.anatomy import label_table
+from femoreg_torch.case import Model, Part, write_case
+from femoreg_torch.case.femoroplasty import with_device
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import transform_points
 from femoreg_torch.volume import Volume, axis_aligned, write_landmarks, write_volume
@@ -99,3 +103,27 @@ def test_a_side_without_its_head_is_refused(folder):
 def test_a_head_far_from_the_femur_is_refused():
     with pytest.raises(InputError, match="FH"):
         neck_axis_entry(left_hip(), IDS["femur_left"], -HEAD)
+
+
+def with_model(folder, model):
+    """A case of the folder whose device has another model, beside a mesh that was written for it."""
+    settings = load_simulation("paper")
+    known = read_preoperative(folder, "left", 3, settings, folder / "device.stl")
+    device = replace(known.device, model=model)
+    write_case(folder, with_device(replace(known.case, folder=folder), device))
+    return settings
+
+
+def test_a_device_of_a_named_material_is_imaged_as_the_settings_say(folder):
+    path = folder / "device.stl"
+    settings = with_model(folder, Model(path, None, material="steel"))
+    known = read_preoperative(folder, "left", 3, settings, folder / "unused.stl")
+    assert known.device.model.hu == settings.acquisition.device_hu
+    assert known.device.model.material is None
+
+
+def test_a_device_of_parts_is_refused(folder):
+    path = folder / "device.stl"
+    settings = with_model(folder, Model(path, None, parts=(Part(path, material="steel"),)))
+    with pytest.raises(InputError, match="has parts, but a simulation images one mesh"):
+        read_preoperative(folder, "left", 3, settings, folder / "unused.stl")

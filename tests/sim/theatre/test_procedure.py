@@ -21,6 +21,7 @@ from femoreg_torch.geometry import invert_rigid, load_carm, log_se3, project_poi
 from femoreg_torch.volume import Volume, axis_aligned
 from sim.theatre.field_of_view import field_of_view
 from sim.theatre.images import simulate_images
+from sim.theatre.metal import metal_in_beam
 from sim.theatre.nominal_poses import nominal_ap, nominal_device
 from sim.theatre.preoperative_case import Preoperative
 from sim.theatre.procedure import draw_procedure
@@ -100,7 +101,8 @@ def test_the_truth_hits_the_balls_in_all_views(known, mesh, settings, patient):
     procedure = draw_procedure(known, mesh, acquisition, generator)
     camera = known.case.carm.camera
     acquisition = replace(acquisition, step_mm=1.0)
-    args = (known.femur, HEAD, mesh, procedure, camera, acquisition, model, generator)
+    metal = metal_in_beam(mesh, 0, acquisition)
+    args = (known.femur, HEAD, metal, procedure, camera, acquisition, model, generator)
     images = simulate_images(*patient, *args, report=lambda _: None)
     truth = procedure.truth
     assert len(images) == 3

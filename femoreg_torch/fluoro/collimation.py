@@ -1,0 +1,324 @@
+"""Which part of the detector is exposed: shutters, and the black ring of an image intensifier, found in a raw image.
+
+A shutter is told from dense bone and from steel by its shape. What is dark and reaches the border must be all that lies
+beyond a circle, straight lines, or both, and nearly all along these the image must drop sharply to nearly black. One
+straight edge alone is not enough: a steel bar along the border looks just like it. Everything is fitted on pixels of
+about 1 mm, in mm on the detector.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from femoreg_torch.fluoro.intensity import downsample
+from femoreg_torch.geometry import Camera
+
+MARGIN_MM = 2.5  # on the detector, from the edge: the penumbra of a focal spot of 0.6 mm
+_PIXEL_MM = 1.0  # that edges are looked for on
+_LEVELS = 14  # tried as the grey value that parts shadow and field
+_LEAST_SHADOW, _LEAST_FIELD = 0.02, 0.04  # shares of the detector
+_MOST_SIDES = 4
+_MOST_POINTS = 800  # of an edge
+_TRIES = 150  # random circles or lines
+_TOLERANCE_MM = 1.0  # of edge points from a circle or line
+_LEAST_SHARE = 0.06  # of the edge points: what fewer lie on is no side
+_LEAST_DARK = 0.97  # of what lies beyond a side; the rest may be letters
+_NEAR_MM, _FAR_MM = 3.0, 6.0  # from the edge: where grey values on both sides of it are taken
+_MOST_RATIO = 0.35  # of the grey value beyond the edge to that inside
+_LEAST_SHARP = 0.75  # share of the edge that is as dark and as sharp; an instrument may cross the rest
+_SHARP_ENOUGH = 0.97  # to try no other grey value
+_MOST_RESIDUAL_MM = 0.7
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """A shutter in one image."""
+
+    shape: str  # in words
+    exposed: float  # share of the detector
+    field: Tensor  # (H, W) bool: the pixels inside, without the penumbra
+
+
+def exposed_field(raw: Tensor, camera: Camera) -> Tensor | None:
+    """The pixels (H, W), bool, of a raw image (bone dark) that no shutter shades; None if there is none.
+
+    A margin of 2.5 mm is taken off inside the shutter's edge.
+    """
+    shutter = find_shutter(raw, camera)
+    return None if shutter is None else shutter.field
+
+
+def without_penumbra(exposed: Tensor, camera: Camera) -> Tensor:
+    """A mask (H, W) less a margin of 2.5 mm along its edge; the detector's border is no edge."""
+    inside = exposed.numpy().astype(np.uint8)
+    apart = torch.from_numpy(cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))  # of the nearest pixel
+    return exposed & ((apart - 0.5) * camera.mean_pixel_mm >= MARGIN_MM)
+
+
+def find_shutter(raw: Tensor, camera: Camera) -> Shutter | None:
+    """The shutter in a raw image (H, W), bone dark; None where there is none."""
+    factor = max(1, round(_PIXEL_MM / camera.mean_pixel_mm))
+    image = cv2.medianBlur(downsample(raw, factor).clamp_min(0).numpy(), 3).astype(np.float64)
+    grid = _Grid(image.shape, (camera.pixel_mm[1] * factor, camera.pixel_mm[0] * factor))
+    best = None
+    for level in _levels(image):
+        fit = _fit(image, level, grid)
+        if fit is not None and (best is None or fit.sharp > best.sharp):
+            best = fit
+        if best is not None and best.sharp > _SHARP_ENOUGH:
+            break
+    if best is None:
+        return None
+    rows, columns = (torch.arange(n, dtype=torch.float64) for n in raw.shape)
+    # from the middle of the coarse pixels' first to pixels of the image
+    x = (columns + 0.5) * camera.pixel_mm[1] - 0.5 * grid.pixel_mm[0]
+    y = (rows + 0.5) * camera.pixel_mm[0] - 0.5 * grid.pixel_mm[1]
+    places = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2).numpy()
+    exposed = torch.from_numpy(best.inside(places)).reshape(raw.shape)
+    return Shutter(best.name, float(exposed.double().mean()), without_penumbra(exposed, camera))
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Coarse pixels: places (N, 2) along columns and rows, in mm from the middle of the first pixel."""
+
+    shape: tuple[int, ...]
+    pixel_mm: tuple[float, float]  # along columns, rows
+
+    @property
+    def edge_mm(self) -> float:
+        """The longer side of a pixel."""
+        return max(self.pixel_mm)
+
+    @property
+    def places(self) -> Array:
+        rows, columns = np.indices(self.shape)
+        return self.at(np.stack([columns, rows], -1).reshape(-1, 2))
+
+    def at(self, pixels: NDArray[np.int64]) -> Array:
+        """Places of pixels (N, 2), column and row."""
+        return np.asarray(pixels * np.array(self.pixel_mm))
+
+    def within(self, places: Array) -> Mask:
+        """Which places lie on the detector."""
+        last = np.array(self.shape[::-1]) - 1
+        pixels = places / self.pixel_mm
+        return np.asarray(((pixels >= 0) & (pixels <= last)).all(-1))
+
+    def values(self, image: Array, places: Array) -> Array:
+        """An image at places (..., 2), interpolated; nan off the detector."""
+        last = np.array(self.shape[::-1]) - 1
+        pixels = (places / self.pixel_mm).clip(0, last)
+        low = np.minimum(pixels.astype(np.int64), last - 1)
+        (x, y), (right, down) = np.moveaxis(low, -1, 0), np.moveaxis(pixels - low, -1, 0)
+        above = image[y, x] * (1 - right) + image[y, x + 1] * right
+        below = image[y + 1, x] * (1 - right) + image[y + 1, x + 1] * right
+        return np.where(self.within(places), above * (1 - down) + below * down, np.nan)
+
+
+@dataclass(frozen=True)
+class _Circle:
+    middle: Array
+    radius: float
+
+    def depth(self, places: Array) -> Array:
+        """How far inside places (..., 2) lie, mm."""
+        return np.asarray(self.radius - np.linalg.norm(places - self.middle, axis=-1))
+
+    def outwards(self, places: Array) -> Array:
+        apart = places - self.middle
+        return np.asarray(apart / np.linalg.norm(apart, axis=-1, keepdims=True).clip(1e-9))
+
+    def edge(self, step_mm: float, grid: _Grid) -> Array:
+        """Places along it."""
+        angles = np.linspace(0, 2 * np.pi, max(8, round(2 * np.pi * self.radius / step_mm)), endpoint=False)
+        return np.asarray(self.middle + self.radius * np.stack([np.cos(angles), np.sin(angles)], -1))
+
+    def refitted(self, places: Array) -> "_Circle":
+        return _circle_of(places)
+
+
+@dataclass(frozen=True)
+class _Line:
+    normal: Array  # (2,) unit vector, outwards
+    offset: float  # of the line along it
+
+    def depth(self, places: Array) -> Array:
+        return np.asarray(self.offset - places @ self.normal)
+
+    def outwards(self, places: Array) -> Array:
+        return np.broadcast_to(self.normal, places.shape)
+
+    def edge(self, step_mm: float, grid: _Grid) -> Array:
+        along = np.array([-self.normal[1], self.normal[0]])
+        middle = (np.array(grid.shape[::-1]) - 1) * grid.pixel_mm / 2
+        reach = float(np.linalg.norm(middle))
+        foot = middle + self.depth(middle) * self.normal
+        return np.asarray(foot + np.arange(-reach, reach, step_mm)[:, None] * along)
+
+    def refitted(self, places: Array) -> "_Line":
+        line = _line_of(places)
+        return line if line.normal @ self.normal > 0 else _Line(-line.normal, -line.offset)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Sides that bound the field, and the share of its edge that is sharp."""
+
+    sides: list[_Circle | _Line] = field(default_factory=list)
+    sharp: float = 0.0
+
+    @property
+    def name(self) -> str:
+        round_, straight = (any(isinstance(side, kind) for side in self.sides) for kind in (_Circle, _Line))
+        return "round and straight" if round_ and straight else "round" if round_ else "rectangular"
+
+    def inside(self, places: Array) -> Mask:
+        """Which places (N, 2) lie in the field."""
+        return np.asarray(np.all([side.depth(places) >= 0 for side in self.sides], axis=0))
+
+
+def _levels(image: Array) -> Iterator[float]:
+    """Grey values that may part shadow and field, the darkest first."""
+    dark, bright = np.quantile(image, [0.002, 0.995])
+    lowest = max(float(dark) * 1.2, float(bright) * 1e-4)
+    if bright > 0 and lowest < 0.3 * bright:
+        yield from np.geomspace(lowest, 0.3 * bright, _LEVELS).tolist()
+
+
+def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
+    """The field of a shutter whose shadow is darker than `level`."""
+    shadow = _reaching_the_border(image < level)
+    if not _LEAST_SHADOW <= shadow.mean() <= 1 - _LEAST_FIELD:
+        return None
+    bright = _largest(~shadow)
+    if bright.sum() < (1 - 0.03) * (~shadow).sum():
+        return None
+    sides = _sides(shadow, bright, grid)
+    if not sides:
+        return None
+    refined: list[_Circle | _Line] = []
+    sharp = total = 0
+    seen = set()
+    for side in sides:
+        places = side.edge(grid.edge_mm, grid)
+        here = np.all([other.depth(places) >= -grid.edge_mm for other in sides if other is not side], axis=0)
+        places = places[grid.within(places) & here]
+        kept, known = _sharp_edge(image, places, side.outwards(places), grid)
+        total += known
+        sharp += len(kept)
+        if len(kept) < 8:
+            return None
+        better = side.refitted(kept)
+        for _ in range(2):  # without what lies off
+            off = np.abs(better.depth(kept))
+            better = side.refitted(kept[off <= max(3 * float(np.median(off)), 0.1)])
+        if np.quantile(np.abs(better.depth(kept)), 0.8) > _MOST_RESIDUAL_MM * max(1.0, 0.5 * grid.edge_mm):
+            return None
+        if isinstance(better, _Circle):
+            apart = kept - better.middle
+            seen = set(zip((apart[:, 0] > 0).tolist(), (apart[:, 1] > 0).tolist(), strict=True))
+        refined.append(better)
+    if sharp < _LEAST_SHARP * total or (len(seen) < 3 and sum(isinstance(side, _Line) for side in refined) < 2):
+        return None
+    return _Fit(refined, sharp / total)
+
+
+def _sharp_edge(image: Array, places: Array, outwards: Array, grid: _Grid) -> tuple[Array, int]:
+    """Where the image drops sharply to nearly black along an edge (N, 2): the places of half height, of how many."""
+    near, far = (max(mm, pixels * grid.edge_mm) for mm, pixels in ((_NEAR_MM, 1.5), (_FAR_MM, 3.0)))
+    steps = np.linspace(-far, far, 49)
+    profiles = grid.values(image, places[:, None] + steps[:, None] * outwards[:, None])  # (N, 49)
+    usable = np.isfinite(profiles[:, np.abs(steps) <= near]).all(1)
+    profiles, places, outwards = profiles[usable], places[usable], outwards[usable]
+    if not len(profiles):
+        return places, 0
+    inner, outer = (np.nanmean(profiles[:, part], axis=1) for part in (steps <= -near, steps >= near))
+    height = (profiles - outer[:, None]) / np.maximum(inner - outer, 1e-12)[:, None]
+    core = np.abs(steps) <= near
+    falls = (height[:, core][:, 0] > 0.6) & (height[:, core][:, -1] < 0.25)
+    middle = (height[:, core] > 0.5).sum(1) * (steps[1] - steps[0]) - near
+    sharp = (outer < _MOST_RATIO * inner) & falls
+    return (places + middle[:, None] * outwards)[sharp], len(profiles)
+
+
+def _reaching_the_border(mask: Mask) -> Mask:
+    """Those parts of a mask that reach the border."""
+    _, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    rim = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
+    return np.isin(parts, np.unique(rim[rim > 0]))
+
+
+def _largest(mask: Mask) -> Mask:
+    """The largest connected part of a mask."""
+    _, parts, counts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    return np.asarray(parts == 1 + int(counts[1:, cv2.CC_STAT_AREA].argmax()))
+
+
+def _sides(shadow: Mask, bright: Mask, grid: _Grid) -> list[_Circle | _Line]:
+    """A circle and lines that lie along the edge of a shadow, with nothing but shadow beyond them."""
+    edge = bright & ~cv2.erode(bright.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    edge[:3] = edge[-3:] = False
+    edge[:, :3] = edge[:, -3:] = False
+    left = grid.at(np.argwhere(edge)[:, ::-1])
+    left = left[:: 1 + len(left) // _MOST_POINTS]
+    count, places, middle = len(left), grid.places, grid.at(np.argwhere(bright)[:, ::-1]).mean(0)
+    tolerance = max(_TOLERANCE_MM, 0.75 * grid.edge_mm)
+    generator = np.random.default_rng(0)
+    sides: list[_Circle | _Line] = []
+    for _ in range(2 * (_MOST_SIDES + 1)):  # some may be edges of an instrument
+        if len(left) < max(12, _LEAST_SHARE * count):
+            break
+        best, near = _best_side(left, middle, tolerance, generator, any(isinstance(s, _Circle) for s in sides))
+        if best is None or near.sum() < max(12, _LEAST_SHARE * count):
+            break
+        left = left[~near]
+        beyond = best.depth(places) < -2 * tolerance
+        if beyond.any() and shadow.reshape(-1)[beyond].mean() >= _LEAST_DARK:
+            sides.append(best)
+    return sides if sum(isinstance(side, _Line) for side in sides) <= _MOST_SIDES else []
+
+
+def _best_side(
+    points: Array, middle: Array, tolerance: float, generator: np.random.Generator, straight: bool
+) -> tuple[_Circle | _Line | None, Mask]:
+    """The circle or line, or line alone, that most of the points (N, 2) lie on, and which; `middle` lies inside."""
+    best: _Circle | _Line | None = None
+    most, size = np.zeros(len(points), bool), float(np.ptp(points, axis=0).max())
+    for count in (2,) if straight else (2, 3):
+        for chosen in points[generator.integers(len(points), size=(_TRIES, count))]:
+            side = _line_of(chosen) if count == 2 else _circle_of(chosen)
+            if isinstance(side, _Circle) and not 0.1 * size < side.radius < 2 * size:
+                continue
+            if isinstance(side, _Line) and side.depth(middle) < 0:
+                side = _Line(-side.normal, -side.offset)
+            near = np.abs(side.depth(points)) <= tolerance
+            if near.sum() > most.sum():
+                best, most = side, near
+    if best is not None:
+        best = best.refitted(points[most])
+        most = np.abs(best.depth(points)) <= 1.5 * tolerance
+    return best, most
+
+
+def _line_of(points: Array) -> _Line:
+    """The line through points (N, 2), by least squares."""
+    middle = points.mean(0)
+    normal = np.linalg.svd(points - middle)[2][-1]
+    return _Line(normal, float(normal @ middle))
+
+
+def _circle_of(points: Array) -> _Circle:
+    """The circle through points (N, 2), by algebraic least squares."""
+    origin = points.mean(0)
+    moved = points - origin
+    unknowns = np.linalg.lstsq(np.c_[2 * moved, np.ones(len(points))], (moved**2).sum(1), rcond=None)[0]
+    return _Circle(unknowns[:2] + origin, float(np.sqrt(max(unknowns[2] + unknowns[:2] @ unknowns[:2], 0.0))))

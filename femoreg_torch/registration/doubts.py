@@ -1,0 +1,89 @@
+"""What speaks against a result besides the quality of its objects: the C-arm's file, its poses, and the plan."""
+
+import math
+
+import torch
+from scipy.spatial import cKDTree
+
+from femoreg_torch.case import Case
+from femoreg_torch.geometry import Poses, orbit_angles, pose_difference, transform_points
+from femoreg_torch.registration.covariance import PoseCovariance
+from femoreg_torch.registration.quality import Limits, shift_px
+from femoreg_torch.registration.scene import Scene
+
+# A mobile C-arm that turns about its orbit comes back within some mm and degrees (the paper draws 2 mm and 1°), and
+# sags by a few mm more. A mirrored image ended 121 mm and 10° off.
+_MOST_OFF_ORBIT_MM, _MOST_OFF_ORBIT_DEG = 60.0, 15.0
+_ORBIT_DEG = 100.0
+# Entry point and target lie on or in the bone. Marrow is as light as soft tissue, so that voxels of bone may be some mm
+# away.
+_MOST_FROM_BONE_MM = 12.0
+_ALONG = 40  # points of the path that are looked at
+
+
+def doubts(case: Case, scene: Scene, poses: Poses, covariance: PoseCovariance, limits: Limits) -> tuple[str, ...]:
+    """All that speaks against a result besides the quality of its objects, in words."""
+    return (
+        *doubts_about_the_carm(scene, covariance, limits),
+        *doubts_about_the_views(scene, poses),
+        *doubts_about_the_plan(case, scene),
+    )
+
+
+def doubts_about_the_carm(scene: Scene, covariance: PoseCovariance, limits: Limits) -> tuple[str, ...]:
+    """What the images say against the C-arm's file, in words; nan counts as that."""
+    camera, uncertainty, mean = scene.carm.camera, scene.carm.uncertainty, covariance.intrinsics.mean
+    advice = "check the C-arm's file, the pixel size and whether the images are cropped"
+    doubts = []
+    if not abs(float(mean[0])) <= limits.most_intrinsics_sigma:
+        fitted = camera.sdd_mm * math.exp(float(mean[0]) * uncertainty.sdd_percent / 100)
+        doubts.append(
+            f"the images fit a source distance of {fitted:.0f} mm, the C-arm's file says {camera.sdd_mm:.0f} mm "
+            f"(± {uncertainty.sdd_percent:.1f} %): {advice}"
+        )
+    for view, shift in enumerate(mean[1:].view(-1, 2)):
+        if not float(shift.abs().max()) <= limits.most_intrinsics_sigma:
+            x, y = shift_px(scene.carm, shift)
+            doubts.append(
+                f"the images of view {view + 1} fit a principal point ({x:.0f}, {y:.0f}) pixels from where the C-arm's "
+                f"file says (± {uncertainty.principal_point_mm:.1f} mm): {advice}"
+            )
+    return tuple(doubts)
+
+
+def doubts_about_the_views(scene: Scene, poses: Poses) -> tuple[str, ...]:
+    """Views whose C-arm was found where its orbit does not lead, in words; none where its poses are given."""
+    if scene.camera_from_camera1 is not None:
+        return ()
+    orbit = scene.carm.orbit(orbit_angles(_ORBIT_DEG, 1.0))
+    isocentre = torch.tensor(scene.carm.isocentre_mm, dtype=torch.float64)
+    told = []
+    for view, found in enumerate(poses.camera_from_camera1[1:], 2):
+        deg, mm = min(pose_difference(pose, found, isocentre) for pose in orbit)
+        if not (deg <= _MOST_OFF_ORBIT_DEG and mm <= _MOST_OFF_ORBIT_MM):
+            told.append(
+                f"the C-arm of view {view} lies {mm:.0f} mm and {deg:.0f}° off its orbit: check that the image is not "
+                "mirrored or turned and shows the same patient; if the C-arm was moved so far, give its poses"
+            )
+    return tuple(told)
+
+
+def doubts_about_the_plan(case: Case, scene: Scene) -> tuple[str, ...]:
+    """A planned path that does not lie in its bone, in words."""
+    plan = case.plan
+    if plan is None or plan.object not in scene.objects or case.objects[plan.object].model is not None:
+        return ()
+    volume = scene.objects[plan.object].volume
+    voxels = transform_points(volume.lps_from_index, volume.data.nonzero().flip(1).double())
+    share = torch.linspace(0, 1, _ALONG, dtype=torch.float64)[:, None]
+    path = plan.entry_point + share * (plan.target - plan.entry_point)
+    away = cKDTree(voxels.numpy()).query(path.numpy())[0]
+    for where, mm in (("entry point", away[0]), ("target", away[-1])):
+        if mm > _MOST_FROM_BONE_MM:
+            return (
+                f"the planned {where} lies {mm:.0f} mm from the {plan.object}: check `plan`; its points are LPS mm of "
+                "the CT",
+            )
+    if away.max() > _MOST_FROM_BONE_MM:
+        return (f"the planned path leaves the {plan.object} by {away.max():.0f} mm: check `plan`",)
+    return ()

@@ -1,0 +1,110 @@
+"""The C-arm's intrinsics as degrees of freedom: one source distance for all views, a principal point for each."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.geometry import CameraChange
+from femoreg_torch.optimize import Quadratic
+
+# The penalty that a deviation of one standard deviation adds to the mean patch NCC is half of this. Near a solution the
+# mean patch NCC behaves like a log-likelihood times 2e-5 (R / S of `registration.covariance` over development
+# cases), so that the file's word weighs as much as it is worth against images, and counts where they say nothing.
+PRIOR_WEIGHT = 2e-5
+
+# What the images' own deviations do not tell, found on three development cases whose C-arm is right: soft tissue and
+# scatter that are drawn a little wrong look like another source distance or principal point.
+_MISFIT_SDD = 0.0025
+_MISFIT_MM = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Intrinsics:
+    """What moves beside the bodies where the cameras are refined.
+
+    A delta holds the logarithm of the source distance, then x and y of the principal point of every view, in units of
+    `scale` (1 + 2 V,), the standard deviations of the C-arm's file: 1 and mm on the detector. Those of scale zero stay
+    as they are. `offset` (1 + 2 V,) is how far the cameras lie from the file already, 1 and mm.
+
+    With them the C-arm of every view slides before the named `objects`, so that something at `reach` (V,), its depth by
+    the source distance, stays where it is seen and as large as it is seen: what remains is the change of perspective. A
+    search without this coupling creeps along a narrow valley. Zeros where the C-arm's poses are known and stay.
+    """
+
+    objects: tuple[str, ...]  # what is drawn; what has not been looked for yet stays where it is expected
+    scale: Tensor
+    offset: Tensor
+    reach: Tensor
+    sdd_mm: float  # before
+
+    @property
+    def free(self) -> Tensor:
+        """Indices (n,) of the degrees of freedom that move."""
+        return self.scale.nonzero()[:, 0]
+
+    @property
+    def units_off(self) -> Tensor:
+        """How far the free ones lie from the C-arm's file, (n,), in standard deviations."""
+        return (self.offset / self.scale)[self.free]
+
+    def changes(self, delta: Tensor) -> tuple[CameraChange, ...]:
+        """How the camera of every view changes with a delta (n,)."""
+        values = torch.zeros_like(self.scale)
+        values[self.free] = delta * self.scale[self.free]
+        factor = math.exp(float(values[0]))
+        return tuple(CameraChange(factor, (x, y)) for x, y in values[1:].view(-1, 2).tolist())
+
+    def slides(self, deltas: Tensor) -> Tensor:
+        """Motions (P, V, 4, 4) of the objects in the camera of each view for deltas (P, n)."""
+        values = deltas.new_zeros(len(deltas), len(self.scale))
+        values[:, self.free] = deltas * self.scale[self.free]
+        motions = torch.eye(4, dtype=deltas.dtype).repeat(len(deltas), len(self.reach), 1, 1)
+        motions[..., :2, 3] = -values[:, 1:].view(len(deltas), -1, 2) * self.reach[:, None]
+        motions[..., 2, 3] = values[:, :1].expm1() * self.sdd_mm * self.reach
+        return motions
+
+    def slide_rates(self, view: int, sdd_mm: float | None = None) -> Tensor:
+        """How fast the objects slide in the camera of a view, (3, 3) mm, by each of its intrinsics.
+
+        The intrinsics are log source distance and principal point (mm); `sdd_mm` is the distance now, if not `self`'s.
+        """
+        return self.reach[view] * torch.diag(self.reach.new_tensor([-1.0, -1.0, sdd_mm or self.sdd_mm]))[[2, 0, 1]]
+
+    def by_delta(self, view: int) -> Tensor:
+        """Derivatives (3, n) of a view's log source distance and principal point (mm) by the delta."""
+        rows = self.scale.diag()[[0, 1 + 2 * view, 2 + 2 * view]]
+        return rows[:, self.free]
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """What images say of the intrinsics with the bodies refitted, from a quadratic of bodies and then intrinsics."""
+
+    answer: Tensor  # (Σ n_b, n): how the bodies move with the intrinsics, J = −Hxx⁻¹ Hxq
+    curvature: Tensor  # (n, n): S = Hqq + Hqx J
+    scores: Tensor  # (T, n): of tiles, r = s_q + Jᵀ s_x
+
+
+def profile(model: Quadratic, intrinsics: Intrinsics) -> Profile:
+    """The profile of a model whose last degrees of freedom are the intrinsics."""
+    n = len(model.hessian) - len(intrinsics.free)
+    hessian = model.hessian
+    answer = -torch.linalg.pinv(hessian[:n, :n], hermitian=True) @ hessian[:n, n:]
+    scores = model.scores[:, n:] + model.scores[:, :n] @ answer
+    return Profile(answer, hessian[n:, n:] + hessian[n:, :n] @ answer, scores)
+
+
+def doubt(model: Quadratic, intrinsics: Intrinsics) -> float:
+    """By how many standard deviations the images doubt the present intrinsics: the most doubtful one counts.
+
+    A step of Newton along each by itself, the bodies refitted, is compared with its deviation: that of the sandwich
+    estimator over tiles, and what images that are drawn a little wrong feign.
+    """
+    found = profile(model, intrinsics)
+    misfit = torch.full_like(intrinsics.scale, _MISFIT_MM)
+    misfit[0] = _MISFIT_SDD
+    feigned = found.curvature.diagonal() * (misfit / intrinsics.scale)[intrinsics.free]
+    deviation = (found.scores.square().sum(0) + feigned.square()).sqrt()
+    return float((found.scores.sum(0).abs() / deviation).max()) if len(deviation) else 0.0

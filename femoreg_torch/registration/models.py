@@ -1,0 +1,61 @@
+"""Voxels of models: attenuation of a whole object that is no bone, and of each of its parts."""
+
+from dataclasses import dataclass
+
+import torch
+
+from femoreg_torch.case import Model, Part
+from femoreg_torch.volume import (
+    Solid,
+    Volume,
+    bounds_of,
+    label_share,
+    labelled_device,
+    read_bodies,
+    read_mesh,
+    scanned_device,
+    solid_volumes,
+    voxelise_mesh,
+)
+
+MODEL_SPACING_MM = 0.5  # a sleeve's wall is thinner than a CT voxel
+
+
+@dataclass(frozen=True, eq=False)
+class ModelVolumes:
+    """Attenuation (1/mm) of a model in its own space."""
+
+    volume: Volume  # the sum of the parts
+    parts: tuple[Volume, ...]  # each by itself, in the order of the model, all on one grid
+
+
+def model_attenuation(model: Model) -> ModelVolumes:
+    """A model as volumes. Raises `InputError` for a mesh or volume that does not fit."""
+    if model.parts:
+        parts = _parts(model)
+        total = torch.stack([part.data for part in parts]).sum(0)
+        return ModelVolumes(parts[0].with_data(total), parts)
+    whole = _single(model.solids[0]) if model.solids else scanned_device(model.path)
+    return ModelVolumes(whole, (whole,))
+
+
+def _single(part: Part) -> Volume:
+    if part.labels is not None:
+        return labelled_device(part.path, part.labels, part.solid_hu, MODEL_SPACING_MM)
+    mesh = read_mesh(part.path)
+    bounds_of([mesh], str(part.path))
+    return voxelise_mesh(mesh, MODEL_SPACING_MM, part.solid_hu)
+
+
+def _parts(model: Model) -> tuple[Volume, ...]:
+    names = [part.body for part in model.parts if part.body is not None]
+    bodies = read_bodies(model.path, names) if names else {}
+    solids = []
+    for part in model.parts:
+        if part.body is not None:
+            solids.append(Solid(bodies[part.body], part.solid_hu, f"{part.path}, body {part.body}"))
+            continue
+        where = str(part.path) if part.name is None else f"{part.path} ({part.name})"
+        shape = read_mesh(part.path) if part.labels is None else label_share(part.path, part.labels, MODEL_SPACING_MM)
+        solids.append(Solid(shape, part.solid_hu, where))
+    return solid_volumes(solids, MODEL_SPACING_MM)

@@ -1,0 +1,91 @@
+"""Files of CAD meshes: one surface, or several bodies with names. What is read is in mm."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.volume.mesh import check_closed
+
+_SHORTEST_MM, _LONGEST_MM = 5.0, 2000.0  # of a device; beyond them the file is likely in metres, inches or µm
+
+
+def read_mesh(path: Path) -> trimesh.Trimesh:
+    """A closed surface in mm from an STL, PLY, OBJ, OFF, 3MF or GLB file, equal vertices merged.
+
+    Bodies of a file that holds several are taken together. Raises `InputError`.
+    """
+    bodies = _load(Path(path), split_objects=False, split_groups=False)
+    whole = trimesh.util.concatenate(list(bodies.values()))
+    assert isinstance(whole, trimesh.Trimesh)  # as all bodies are
+    return check_closed(whole, str(path))
+
+
+def read_bodies(path: Path, names: Sequence[str]) -> dict[str, trimesh.Trimesh]:
+    """The closed bodies in mm of a 3MF, GLB or OBJ file by name, in the order of `names`.
+
+    Bodies of an OBJ file are its objects, or its groups where it has not more than one object. Raises `InputError`
+    unless `names` are those of all bodies of the file.
+    """
+    path = Path(path)
+    bodies = _load(path, split_objects=True, split_groups=False)
+    if path.suffix.lower() == ".obj" and len(bodies) == 1:
+        bodies = _load(path, split_objects=False, split_groups=True)
+    unknown = [name for name in names if name not in bodies]
+    unnamed = [name for name in bodies if name not in names]
+    if unknown or unnamed:
+        wrong = [f"{', '.join(unknown)} is not in the file"] if unknown else []
+        wrong += [f"{', '.join(unnamed)} has no material"] if unnamed else []
+        raise InputError(
+            f"{path}: {' and '.join(wrong)}. Name each body once under `parts`; the file has: {', '.join(bodies)}."
+        )
+    return {name: check_closed(bodies[name], f"{path}, body {name}") for name in names}
+
+
+def bounds_of(meshes: Sequence[trimesh.Trimesh], where: str) -> np.ndarray:
+    """The lowest and the highest corner (2, 3) of the meshes of a device, mm.
+
+    Raises `InputError` that starts with `where` if no device is of that size.
+    """
+    corners = np.concatenate([mesh.bounds for mesh in meshes])
+    bounds = np.stack([corners.min(0), corners.max(0)])
+    longest = float((bounds[1] - bounds[0]).max())
+    if not _SHORTEST_MM <= longest <= _LONGEST_MM:
+        raise InputError(
+            f"{where}: its longest edge is {longest:.3g} mm, but a device has {_SHORTEST_MM:g} to {_LONGEST_MM:g} mm. "
+            "The file is to be in mm (a GLB in metres, a 3MF in the unit that it names)."
+        )
+    return bounds
+
+
+def _load(path: Path, split_objects: bool, split_groups: bool) -> dict[str, trimesh.Trimesh]:
+    """The surfaces of a file by name, where they stand in the file's scene, in mm. OBJ files can be split."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    if path.suffix.lower() in (".step", ".stp"):
+        raise InputError(f"{path}: is a STEP file. Export it as STL, or as 3MF if it has several bodies.")
+    options: dict[str, Any] = {}
+    if path.suffix.lower() == ".obj":
+        options = {"split_objects": split_objects, "split_groups": split_groups, "group_material": False}
+    try:
+        scene = trimesh.load_scene(path, process=False, **options)
+    except Exception as error:  # trimesh's readers raise whatever their parsing runs into
+        raise InputError(f"{path}: cannot be read as a mesh (STL, PLY, OBJ, OFF, 3MF or GLB): {error}.") from error
+    mm = 1.0 if scene.units is None else trimesh.units.unit_conversion(scene.units, "mm")
+    bodies = {}
+    for name in sorted(scene.graph.nodes_geometry):
+        place, geometry = scene.graph[name]
+        surface = scene.geometry[geometry]
+        if not isinstance(surface, trimesh.Trimesh):
+            raise InputError(f"{path}: triangle meshes were expected, found {type(surface).__name__}.")
+        mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+        mesh.apply_transform(place)
+        mesh.apply_scale(mm)
+        mesh.merge_vertices()
+        bodies[name] = mesh
+    if not bodies:
+        raise InputError(f"{path}: the mesh holds no triangle.")
+    return bodies

@@ -1,0 +1,284 @@
+"""The procedures of a study imaged again under other conditions: other devices, other X-rays, cases that tell less.
+
+Almost all time goes into the patient's mass along the rays, which is the same under most conditions. It is kept, view
+by view, so that each further condition costs a few seconds. Remove the folder of bodies when patients, or their line
+integrals, have changed.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from femoreg_torch.configs import laid_over, load_preset
+from joblib import Parallel, delayed, parallel_config
+from torch import Tensor
+
+from femoreg_torch.case import new_folder
+from femoreg_torch.case.femoroplasty import DEVICE
+from femoreg_torch.case.model import Case
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import plain, read_json, temporary_file, write_json, write_text
+from femoreg_torch.geometry import Camera
+from femoreg_torch.settings import read_record
+from femoreg_torch.volume import Volume, read_ct, read_labels, read_mesh
+from sim.patient import Patient, make_scans
+from sim.study.cases import PROCEDURAL_IMAGED_MM, REAL_IMAGED_MM, REGISTERED_MM, Stores, subject_folder
+from sim.study.procedures import Procedure, Study
+from sim.theatre import procedure as theatre
+from sim.theatre.case_folders import check_same_patient, copied, write_images_and_case, write_patient_case
+from sim.theatre.device import make_device_parts
+from sim.theatre.images import ViewImages, posed_tissue, view_images
+from sim.theatre.metal import draw_materials, metal_in_beam
+from sim.theatre.posed_tissue import PosedTissue, areal_posed_tissue
+from sim.theatre.preoperative_case import Preoperative, read_preoperative
+from sim.theatre.settings import Simulation
+
+_ORIGIN = "study.json"
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a case says about what was imaged."""
+
+    parts: bool = False  # the device's parts, each with its material; else one device of `device_hu`
+    materials: dict[str, str] = field(default_factory=dict)  # told in place of the true ones
+    device_images: bool = True
+    sdd: float = 1.0  # distance from source to detector that is told, of the true one
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Settings that are laid over those of a study, and what its cases say."""
+
+    name: str
+    acquisition: dict[str, Any] = field(default_factory=dict)
+    xray: dict[str, Any] = field(default_factory=dict)
+    told: Told = field(default_factory=Told)
+
+
+@dataclass(frozen=True)
+class _Conditions:
+    conditions: list[Condition]
+
+
+@dataclass(frozen=True)
+class Imaged:
+    """Folders that conditions are written to."""
+
+    bodies: Path
+    conditions: Path
+
+    def case(self, condition: Condition, procedure: Procedure) -> Path:
+        """Where the case of a procedure under a condition stands."""
+        return self.conditions / condition.name / procedure.name
+
+
+def read_conditions(name: str | Path, only: Sequence[str] = ()) -> list[Condition]:
+    """Conditions of a preset in `configs/study/` or of a YAML file, or those of some names. Raises `InputError`."""
+    known = read_record(_Conditions, load_preset("study", name), f"conditions {name}").conditions
+    names = [condition.name for condition in known]
+    for wanted in only:
+        if wanted not in names:
+            raise InputError(f"conditions {name}: there is no {wanted!r}; there are: {', '.join(names)}.")
+    return [condition for condition in known if not only or condition.name in only]
+
+
+def make_conditions(
+    chosen: Sequence[Procedure], conditions: Sequence[Condition], study: Study, stores: Stores, out: Imaged, jobs: int
+) -> None:
+    """Make the cases that are not there yet, `jobs` procedures at a time and each on one core."""
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        Parallel(n_jobs=jobs, verbose=5)(
+            delayed(_image_alone)(procedure, conditions, study, stores, out) for procedure in chosen
+        )
+
+
+def _image_alone(
+    procedure: Procedure, conditions: Sequence[Condition], study: Study, stores: Stores, out: Imaged
+) -> None:
+    torch.set_num_threads(1)
+    image_procedure(procedure, conditions, study, stores, out, lambda _: None)
+
+
+def image_procedure(
+    procedure: Procedure,
+    conditions: Sequence[Condition],
+    study: Study,
+    stores: Stores,
+    out: Imaged,
+    report: Callable[[str], None],
+) -> None:
+    """Make the cases of a procedure under all conditions, but for those that are there."""
+    body = _Body(procedure, stores, out.bodies / procedure.name)
+    for condition in conditions:
+        if not _ready(condition, procedure, study, out):
+            report(condition.name)
+            _make_case(condition, procedure, study, body, out.case(condition, procedure))
+
+
+def _ready(condition: Condition, procedure: Procedure, study: Study, out: Imaged) -> bool:
+    """Whether a case is there. Raises `InputError` if it was made with other settings."""
+    path = out.case(condition, procedure) / _ORIGIN
+    if not path.is_file():
+        return False
+    if read_json(path) != _origin(condition, procedure, study):
+        raise InputError(f"{path.parent}: was made with other settings than those of this condition. Remove it.")
+    return True
+
+
+def _origin(condition: Condition, procedure: Procedure, study: Study) -> dict[str, Any]:
+    voxels = (REGISTERED_MM, _imaged_mm(procedure))
+    told = {"procedure": asdict(procedure), "voxels_mm": voxels, "told": asdict(condition.told)}
+    return plain(told | {"simulation": _content(condition, study)})
+
+
+def _content(condition: Condition, study: Study) -> dict[str, Any]:
+    change = {"acquisition": condition.acquisition, "xray": condition.xray}
+    return laid_over(load_preset("simulation", study.acquisition), change, f"condition {condition.name}")
+
+
+def _imaged_mm(procedure: Procedure) -> float:
+    return PROCEDURAL_IMAGED_MM if procedure.procedural else REAL_IMAGED_MM
+
+
+class _Body:
+    """The patient of a procedure: its folder, and its mass along the rays of any view, made once and kept on disk."""
+
+    def __init__(self, procedure: Procedure, stores: Stores, folder: Path) -> None:
+        self.procedure, self.stores, self.folder = procedure, stores, folder
+        self._scans: tuple[Patient, Patient] | None = None
+        self._tissue: tuple[str, PosedTissue] | None = None  # the last one, and what it depends on
+        self._images: tuple[str, list[ViewImages]] | None = None  # the same
+
+    @property
+    def device_seed(self) -> int:
+        """The seed of the device: that of a computed patient, or of the procedure."""
+        return int(self.procedure.patient) if self.procedure.procedural else self.procedure.seed
+
+    def patient(self) -> Path:
+        """The folder of what is known before the operation; it is made if need be."""
+        if not self.procedure.procedural:
+            return subject_folder(self.procedure.patient, REGISTERED_MM, self.stores)
+        folder = self.folder / "patient"
+        if not folder.is_dir():
+            write_patient_case(self._made()[0], folder, self.device_seed, self.procedure.side)
+        return folder
+
+    def areal(
+        self, pose: Tensor, known: Preoperative, drawn: theatre.Procedure, camera: Camera, step_mm: float
+    ) -> dict[str, Tensor]:
+        """Mass per area (H, W) in g/cm² of each material of the patient, seen from `camera_from_lps` (4, 4)."""
+        key = _digest(pose, drawn.femur_rotation, asdict(camera), step_mm, _imaged_mm(self.procedure))
+        path = self.folder / f"{key}.pt"
+        if path.is_file():
+            found: dict[str, Tensor] = torch.load(path, weights_only=True)
+            return found
+        made = areal_posed_tissue(self._posed(known, drawn, camera), pose, camera, step_mm)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with temporary_file(path) as part:
+            torch.save(made, part)
+        return made
+
+    def images(self, key: str, made: Callable[[], list[ViewImages]]) -> list[ViewImages]:
+        """The last images if they were asked for by the same key, else new ones."""
+        if self._images is None or self._images[0] != key:
+            self._images = key, made()
+        return self._images[1]
+
+    def _posed(self, known: Preoperative, drawn: theatre.Procedure, camera: Camera) -> PosedTissue:
+        key = _digest(drawn.camera_from_pelvis, drawn.femur_rotation, asdict(camera))
+        if self._tissue is None or self._tissue[0] != key:
+            ct, labels = self._imaged(known)
+            self._tissue = key, posed_tissue(ct, labels, known.femur, known.head, drawn, camera)
+        return self._tissue[1]
+
+    def _imaged(self, known: Preoperative) -> tuple[Volume, Volume]:
+        """The finer scan, in HU, and its labels."""
+        if self.procedure.procedural:
+            imaged = self._made()[1]
+            return imaged.ct, imaged.labels
+        folder = subject_folder(self.procedure.patient, REAL_IMAGED_MM, self.stores)
+        ct = read_ct(folder / "ct.nii.gz")
+        labels = read_labels(folder / "labels.nii.gz", ct)
+        check_same_patient(read_labels(known.labels_path, read_ct(known.ct_path)), labels, known.femur)
+        return ct, labels
+
+    def _made(self) -> tuple[Patient, Patient]:
+        if self._scans is None:
+            held, imaged = make_scans(int(self.procedure.patient), (REGISTERED_MM, PROCEDURAL_IMAGED_MM))
+            self._scans = held, imaged
+        return self._scans
+
+
+def _digest(*values: Any) -> str:
+    return hashlib.sha256(json.dumps(plain(values)).encode()).hexdigest()[:16]
+
+
+def _make_case(condition: Condition, procedure: Procedure, study: Study, body: _Body, target: Path) -> None:
+    """Write one case. With the study's own settings its images are those of the study, bit for bit."""
+    settings = read_record(Simulation, _content(condition, study), f"condition {condition.name}")
+    generator = torch.Generator().manual_seed(procedure.seed)
+    patient = body.patient()
+    with new_folder(target) as folder:
+        known = read_preoperative(patient, procedure.side, body.device_seed, settings, folder / f"{DEVICE}.stl")
+        known = copied(known, folder)
+        mesh = read_mesh(known.device.model.path)
+        drawn = theatre.draw_procedure(known, mesh, settings.acquisition, generator)
+        camera, step_mm = known.case.carm.camera, settings.acquisition.step_mm
+
+        def areal(pose: Tensor) -> dict[str, Tensor]:
+            return body.areal(pose, known, drawn, camera, step_mm)
+
+        def imaged() -> list[ViewImages]:
+            metal = metal_in_beam(mesh, body.device_seed, settings.acquisition)
+            return view_images(areal, metal, drawn, camera, step_mm, settings.xray, generator, lambda _: None)
+
+        images = body.images(_digest(_content(condition, study)), imaged)
+        said = replace(known, case=_said(known.case, condition.told))
+        write_images_and_case(folder, said, images, drawn)
+        if not condition.told.device_images:
+            _without_device_images(folder)
+        if condition.told.parts:
+            _name_parts(folder, body.device_seed, condition.told.materials)
+        write_json(folder / _ORIGIN, _origin(condition, procedure, study))
+
+
+def _said(case: Case, told: Told) -> Case:
+    """The case with the C-arm that is told."""
+    camera = replace(case.carm.camera, sdd_mm=case.carm.camera.sdd_mm * told.sdd)
+    return replace(case, carm=replace(case.carm, camera=camera))
+
+
+def _without_device_images(folder: Path) -> None:
+    """Leave only the images of the anatomy in a case; the device stays described."""
+    content = _read_case_file(folder)
+    for view in content["views"]:
+        (folder / view.pop(DEVICE)).unlink()
+    _write_case_file(folder, content)
+
+
+def _name_parts(folder: Path, device_seed: int, told: dict[str, str]) -> None:
+    """Write the parts of the device, and have the case name them, with their materials or with what is told of them."""
+    materials = draw_materials(device_seed)
+    parts = []
+    for name, mesh in make_device_parts(device_seed).items():
+        mesh.export(folder / f"{name}.stl")
+        parts.append({"model": f"{name}.stl", "material": told.get(materials[name], materials[name])})
+    content = _read_case_file(folder)
+    device = {key: value for key, value in content[DEVICE].items() if key not in ("model", "hu")}
+    _write_case_file(folder, content | {DEVICE: {"parts": parts} | device})
+
+
+def _read_case_file(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = yaml.safe_load((folder / "case.yaml").read_text(encoding="utf-8"))
+    return content
+
+
+def _write_case_file(folder: Path, content: dict[str, Any]) -> None:
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+    write_text(folder / "case.yaml", text)

@@ -1,0 +1,176 @@
+"""Shutters of every shape are found to a millimetre, and nothing else is taken for one."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.fluoro import Circle, Polygon, attenuation_image, exposed_field, find_shutter, without_penumbra
+from femoreg_torch.geometry import centred_camera
+
+CAMERA = centred_camera(1020.0, (0.776, 0.776), (384, 384))
+SIZE = 384
+ROW, COLUMN = torch.meshgrid(torch.arange(SIZE).float(), torch.arange(SIZE).float(), indexing="ij")
+
+
+def anatomy(seed: int = 0, dense: float = 3.5) -> Tensor:
+    """Intensity (H, W) behind a patient: soft tissue, bones with edges, and a bright strip of open field."""
+    generator = torch.Generator().manual_seed(seed)
+    lumps = F.interpolate(torch.rand(1, 1, 7, 7, generator=generator), (SIZE, SIZE), mode="bicubic")[0, 0]
+    bones = F.interpolate(torch.rand(1, 1, 24, 24, generator=generator), (SIZE, SIZE), mode="bicubic")[0, 0]
+    through = dense + 1.0 * lumps + 0.8 * (bones > 0.6)
+    through = through * (COLUMN < 350).float()  # beside the patient
+    return 50000 * torch.exp(-smooth(through, 1.0))
+
+
+def smooth(image: Tensor, sigma_px: float) -> Tensor:
+    reach = math.ceil(3 * sigma_px)
+    taps = torch.exp(-0.5 * (torch.arange(-reach, reach + 1) / sigma_px) ** 2)
+    taps = taps / taps.sum()
+    padded = F.pad(image[None, None], (reach,) * 4, mode="replicate")
+    return F.conv2d(F.conv2d(padded, taps.view(1, 1, 1, -1)), taps.view(1, 1, -1, 1))[0, 0]
+
+
+def shaded(beam: Tensor, exposed: Tensor, seed: int = 0, scatter: float = 0.03) -> Tensor:
+    """What is counted with shutters in the beam: penumbra, a little scattered light beyond them, and noise."""
+    light = beam * smooth(exposed.float(), 0.9) + scatter * beam.median()
+    return torch.poisson(light, generator=torch.Generator().manual_seed(seed))
+
+
+def turned(degrees: float, half: tuple[float, float]) -> Polygon:
+    """A rectangle about the middle of the detector."""
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ends = [(a * half[0], b * half[1]) for a, b in signs]
+    return Polygon(tuple((190 + x * cos - y * sin, 193 + x * sin + y * cos) for x, y in ends))
+
+
+FIELDS: dict[str, tuple[Tensor, str]] = {
+    "round": (Circle((185, 200), 150).exposed((SIZE, SIZE)), "round"),
+    "ring of an image intensifier": (Circle((191, 191), 196).exposed((SIZE, SIZE)), "round"),
+    "ring in the corners": (Circle((191, 191), 225).exposed((SIZE, SIZE)), "round"),
+    "rectangle": (turned(0, (150, 120)).exposed((SIZE, SIZE)), "rectangular"),
+    "turned rectangle": (turned(25, (140, 120)).exposed((SIZE, SIZE)), "rectangular"),
+    "turned rectangle over the border": (turned(10, (140, 260)).exposed((SIZE, SIZE)), "rectangular"),
+    "iris and blades": (
+        Circle((190, 190), 170).exposed((SIZE, SIZE)) & turned(0, (110, 300)).exposed((SIZE, SIZE)),
+        "round and straight",
+    ),
+}
+
+
+def overlap(a: Tensor, b: Tensor) -> float:
+    return float((a & b).sum() / (a | b).sum())
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("dense", [0.0, 4.0])
+def test_the_field_is_found(name: str, dense: float) -> None:
+    exposed, shape = FIELDS[name]
+    found = find_shutter(shaded(anatomy(1, dense), exposed), CAMERA)
+    assert found is not None
+    assert found.shape == shape
+    assert found.exposed == pytest.approx(float(exposed.float().mean()), abs=0.01)
+    assert overlap(found.field, without_penumbra(exposed, CAMERA)) > 0.98
+    assert not (found.field & ~exposed).any()
+
+
+def test_instruments_may_cross_the_edge_and_lie_inside() -> None:
+    exposed, _ = FIELDS["round"]
+    beam = anatomy(2)
+    beam[180:200, 150:] *= 0.002  # held from outside
+    beam[250:280, 150:180] *= 0.002
+    found = exposed_field(shaded(beam, exposed), CAMERA)
+    assert found is not None
+    assert overlap(found, without_penumbra(exposed, CAMERA)) > 0.98
+
+
+def test_pixels_of_another_size_and_those_that_are_no_squares() -> None:
+    exposed = Circle((150, 100), 90).exposed((192, 384))
+    camera = replace(CAMERA, pixel_mm=(1.552, 0.776), shape=(192, 384))
+    there = ((ROW[:192] * 2 - 191) ** 2 + (COLUMN[:192] - 190) ** 2).sqrt() < 150
+    found = exposed_field(shaded(anatomy(3)[::2], there), camera)
+    assert found is not None
+    assert not (found & ~there).any()
+    assert overlap(found, there) > 0.94
+    assert not torch.equal(exposed, there)
+    coarse = centred_camera(1020.0, (3.104, 3.104), (96, 96))
+    whole, _ = FIELDS["round"]
+    there = F.avg_pool2d(whole[None].float(), 4)[0] > 0.5
+    found = exposed_field(F.avg_pool2d(shaded(anatomy(3), whole)[None], 4)[0], coarse)
+    assert found is not None
+    assert overlap(found, without_penumbra(there, coarse)) > 0.95
+
+
+def dense_at_the_border() -> Tensor:
+    beam = anatomy(4)
+    beam[:, :70] *= torch.exp(-smooth(4.0 * ((55 + 12 * torch.sin(ROW / 25) > COLUMN).float()), 3.0))[:, :70]
+    return beam
+
+
+def steel_bar(rows: slice, columns: slice) -> Tensor:
+    beam = anatomy(5)
+    beam[rows, columns] *= 1e-4
+    return beam
+
+
+def vignetted() -> Tensor:
+    away = torch.hypot(COLUMN - 100, ROW - 120) / 384
+    return anatomy(6) * torch.exp(-8 * (away - 0.55).clamp_min(0))
+
+
+UNCOLLIMATED: dict[str, Callable[[], Tensor]] = {
+    "plain": lambda: anatomy(7),
+    "air": lambda: torch.full((SIZE, SIZE), 50000.0),
+    "noise": lambda: torch.full((SIZE, SIZE), 20.0),
+    "dense at the border": dense_at_the_border,
+    "bar from the border": lambda: steel_bar(slice(0, 250), slice(100, 140)),
+    "bar across": lambda: steel_bar(slice(150, 190), slice(0, 384)),
+    "bar along the border": lambda: steel_bar(slice(0, 384), slice(0, 40)),
+    "bar at a corner": lambda: steel_bar(slice(0, 200), slice(0, 60)),
+    "dark corner": vignetted,
+    "very dense patient": lambda: anatomy(8, 5.5),
+}
+
+
+@pytest.mark.parametrize("name", UNCOLLIMATED)
+def test_nothing_else_is_taken_for_a_shutter(name: str) -> None:
+    beam = UNCOLLIMATED[name]()
+    counted = torch.poisson(beam + 20, generator=torch.Generator().manual_seed(1))
+    assert exposed_field(counted, CAMERA) is None
+
+
+def test_a_turned_bar_across_a_corner_is_no_shutter() -> None:
+    beam = anatomy(9)
+    along = (COLUMN + ROW) / math.sqrt(2)
+    beam[(along > 60) & (along < 100)] *= 1e-4
+    assert exposed_field(torch.poisson(beam + 5, generator=torch.Generator().manual_seed(1)), CAMERA) is None
+
+
+def test_a_field_told_in_pixels() -> None:
+    circle = Circle((10, 20), 5).exposed((40, 30))
+    assert float(circle.sum()) == pytest.approx(math.pi * 25, rel=0.05)
+    assert circle[25, 10]
+    assert not circle[26, 10]
+    square = Polygon(((3.5, 4.5), (9.5, 4.5), (9.5, 14.5), (3.5, 14.5))).exposed((40, 30))
+    assert torch.equal(square.nonzero().amin(0), torch.tensor([5, 4]))
+    assert torch.equal(square.nonzero().amax(0), torch.tensor([14, 9]))
+    assert int(square.sum()) == 60
+
+
+def test_a_margin_is_taken_off_along_the_edge_and_not_along_the_border() -> None:
+    exposed = COLUMN < 200
+    kept = without_penumbra(exposed, CAMERA)
+    assert torch.equal(kept, (199.5 - COLUMN) * 0.776 >= 2.5)
+
+
+def test_the_open_beam_is_looked_for_within_the_field() -> None:
+    raw = torch.full((60, 60), 1000.0)
+    raw[:, 40:] = 60000.0  # letters burnt into the shadow
+    field = torch.arange(60).expand(60, 60) < 30
+    assert float(attenuation_image(raw, field)[10, 10]) == pytest.approx(0, abs=1e-5)
+    assert float(attenuation_image(raw)[10, 10]) == pytest.approx(math.log(60), abs=1e-3)

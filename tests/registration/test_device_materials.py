@@ -1,0 +1,170 @@
+"""What a device is made of, found from images without and with it; made by other operators than the fit uses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from femoreg_torch.case import Start
+from femoreg_torch.drr import project
+from femoreg_torch.geometry import CArm, Poses, about_point, centred_camera, exp_se3, pose_difference, rigid
+from femoreg_torch.registration.calibration import Calibration, fit_device
+from femoreg_torch.registration.regions import blocks_of, materials, region_paths, touching_faces
+from femoreg_torch.registration.scene import RigidObject, Scene
+from femoreg_torch.volume import Volume, axis_aligned, voxelise_mesh
+
+CARM = CArm(centred_camera(1000.0, (1.5, 1.5), (160, 160)), (0.0, 0.0, 600.0), (0.0, 1.0, 0.0))
+POINT = torch.zeros(3, dtype=torch.float64)
+METAL, LIGHT = 0.8, 0.05  # 1/mm
+SCATTERED = 0.05  # of the open beam
+
+
+def solid(*boxes: tuple[tuple[float, float, float], tuple[float, float, float]], hu: float) -> Volume:
+    """Boxes (size, centre), mm, of one material on a common grid."""
+    frame = trimesh.creation.box((70, 40, 40))
+    whole = voxelise_mesh(frame, 0.5, hu)
+    data = torch.zeros_like(whole.data)
+    index = torch.stack(torch.meshgrid(*(torch.arange(n) for n in data.shape), indexing="ij"), -1).flip(-1).double()
+    points = index * 0.5 + whole.lps_from_index[:3, 3]
+    for size, centre in boxes:
+        inside = ((points - torch.tensor(centre)).abs() <= torch.tensor(size) / 2).all(-1)
+        data[inside] = 1.0
+    return whole.with_data(data)
+
+
+ROD = solid(((60, 5, 5), (0, 0, 0)), hu=0)
+HANDLE = solid(((12, 24, 10), (-20, 15, 4)), hu=0)
+
+
+def poses(motion: torch.Tensor | None = None) -> Poses:
+    angles = torch.tensor([0.0, 15.0, -15.0], dtype=torch.float64) * torch.pi / 180
+    device = exp_se3(torch.tensor([0.2, 0.1, 0.6, 0, 0, 0], dtype=torch.float64))
+    device[:3, 3] = torch.tensor([5.0, -5.0, 560.0])
+    if motion is not None:
+        device = about_point(exp_se3(motion), device[:3, 3])[0] @ device
+    body = rigid(translation=torch.tensor([0.0, 0.0, 640.0], dtype=torch.float64))
+    return Poses(CARM.orbit(angles), {"body": body, "device": device})
+
+
+def make_scene(rod: float, handle: float) -> Scene:
+    """A block of tissue, and before it the device: intensities with a constant scatter, rays four times as fine."""
+    fine = centred_camera(1000.0, (0.375, 0.375), (640, 640))
+    truth = poses()
+    block = Volume(torch.full((30, 60, 60), 0.02), axis_aligned((4.0, 4.0, 2.0), (-118.0, -118.0, -29.0)))
+    alone, together = [], []
+    for view in range(3):
+        body = project(block, truth.camera_from("body")[view][None], fine, 1.0)[0]
+        metal = project(ROD, truth.camera_from("device")[view][None], fine, 0.2)[0]
+        light = project(HANDLE, truth.camera_from("device")[view][None], fine, 0.2)[0]
+        for images, device in ((alone, 0 * metal), (together, rod * metal + handle * light)):
+            intensity = torch.exp(-body - device) + SCATTERED
+            images.append(-torch.nn.functional.avg_pool2d(intensity[None], 4)[0].log())
+    device = ROD.with_data((ROD.data + HANDLE.data).clamp_max(1) * 0.161)  # one bare HU for all
+    objects = {
+        "body": RigidObject(block, POINT, ("anatomy", "device"), Start()),
+        "device": RigidObject(device, POINT, ("device",), Start(truth.camera1_from["device"])),
+    }
+    return Scene(CARM, objects, {"anatomy": tuple(alone), "device": tuple(together)})
+
+
+@pytest.fixture(scope="module")
+def mixed() -> Scene:
+    return make_scene(METAL, LIGHT)
+
+
+def test_material_and_pose_of_a_device_that_is_told_as_one_solid(mixed: Scene) -> None:
+    """A dense rod and a light handle; the pose starts 2.4 mm and 1.5° off."""
+    off = torch.tensor([[0.015, -0.015, 0.015, 1.0, -0.8, 2.0]], dtype=torch.float64)
+    fit = fit_device(mixed, poses(off), "device", "device")
+    assert fit is not None
+    deg, mm = pose_difference(poses().camera1_from["device"], fit.camera1_from, POINT)
+    assert mm < 0.3
+    assert deg < 0.6
+    assert min(fit.attenuations) == pytest.approx(LIGHT, rel=0.25)
+    assert max(fit.attenuations) > 6 * LIGHT
+    of_rod, of_handle = (fit.volume.data[part.data > 0].median() for part in (ROD, HANDLE))
+    assert of_rod > 5 * of_handle
+    for scattered in fit.scattered.values():
+        assert scattered == pytest.approx(SCATTERED, rel=0.35)
+
+
+def test_a_device_that_is_as_the_case_says_stays_so() -> None:
+    scene = make_scene(0.15, 0.15)
+    after, record = Calibration("materials").calibrate(scene, poses())
+    assert torch.equal(after.objects["device"].volume.data, scene.objects["device"].volume.data)
+    assert pose_difference(poses().camera1_from["device"], record.poses.camera1_from["device"], POINT)[1] < 0.2
+    assert record.moving == ("device",)
+    assert "/mm" in record.stop
+
+
+def test_named_parts_keep_their_bounds(mixed: Scene) -> None:
+    """Each named part is one material, whatever is told of it; here both are told wrong."""
+    parts = (ROD.with_data(ROD.data * 0.3), HANDLE.with_data((HANDLE.data - ROD.data).clamp_min(0) * 0.1))
+    total = parts[0].with_data(parts[0].data + parts[1].data)
+    named = replace(mixed.objects["device"], volume=total, parts=parts, materials_known=True)
+    fit = fit_device(replace(mixed, objects=mixed.objects | {"device": named}), poses(), "device", "device")
+    assert fit is not None
+    assert len(fit.attenuations) == 2
+    assert fit.attenuations[1] == pytest.approx(LIGHT, rel=0.2)
+    assert fit.attenuations[0] > 0.4
+
+
+def test_without_images_of_the_device_there_is_nothing_to_do(mixed: Scene) -> None:
+    alone = replace(mixed, images={"anatomy": mixed.images["anatomy"]})
+    assert "no device" in (Calibration("materials").left_out(alone, poses()) or "")
+    assert Calibration("materials").left_out(mixed, poses()) is None
+
+
+def test_paths_through_regions_are_those_of_the_projector() -> None:
+    blocks, count = blocks_of(ROD)
+    pose = poses().camera_from("device")[1]
+    paths = np.asarray(region_paths(ROD, blocks, count, pose, CARM.camera).sum(1)).reshape(160, 160)
+    exact = project(ROD, pose[None], centred_camera(1000.0, (0.375, 0.375), (640, 640)), 0.1)
+    exact = torch.nn.functional.avg_pool2d(exact, 4)[0].numpy()
+    assert paths.sum() == pytest.approx(float(exact.sum()), rel=0.01)
+    assert np.abs(paths - exact).max() < 2.0  # mm of 7 at the rims, where the splat is as wide as a pixel
+
+
+def test_blocks_are_whole_and_small() -> None:
+    blocks, count = blocks_of(ROD)
+    assert ((blocks >= 0) == (ROD.data > 0)).all()
+    assert set(blocks[blocks >= 0].unique().tolist()) == set(range(count))
+    for block in range(count):
+        extent = (blocks == block).nonzero()
+        assert int((extent.amax(0) - extent.amin(0)).max()) < 12  # 6 mm of voxels of 0.5 mm
+
+
+def test_a_device_that_no_view_shows_stays_as_it_is(mixed: Scene) -> None:
+    away = poses()
+    far = rigid(translation=torch.tensor([400.0, 0.0, 0.0], dtype=torch.float64))
+    away = away.with_object("device", far @ away.camera1_from["device"])
+    after, record = Calibration("materials").calibrate(mixed, away)
+    assert after.objects["device"] is mixed.objects["device"]
+    assert torch.equal(record.poses.camera1_from["device"], away.camera1_from["device"])
+    assert "not estimated" in record.stop
+    assert record.moving == ()
+
+
+def test_coarse_and_tiny_solids_have_blocks() -> None:
+    """Voxels longer than a block are one each; a solid of one block touches nothing."""
+    coarse = Volume(torch.ones(2, 1, 1), axis_aligned((1.0, 1.0, 9.0), (0.0, 0.0, 0.0)))
+    blocks, count = blocks_of(coarse)
+    assert count == 2
+    assert touching_faces(blocks).tolist() == [[0, 1, 1]]
+    blocks, count = blocks_of(Volume(torch.ones(2, 2, 2), axis_aligned((1.0, 1.0, 1.0), (0.0, 0.0, 0.0))))
+    assert count == 1
+    assert len(touching_faces(blocks)) == 0
+
+
+def test_few_materials() -> None:
+    values = np.array([0.03, 0.031, 0.028, 0.8, 0.9, 0.85, 0.7])
+    weights = np.array([100, 80, 90, 100, 50, 60, 70])
+    owner, middles = materials(values, weights)
+    assert len(middles) == 2
+    assert len(set(owner[:3])) == len(set(owner[3:])) == 1
+    assert middles[owner[0]] == pytest.approx(0.03, rel=0.1)
+    alike, one = materials(np.array([0.1, 0.12, 0.11]), np.array([1, 1, 1]))
+    assert len(one) == 1
+    assert set(alike) == {0}

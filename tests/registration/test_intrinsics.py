@@ -1,0 +1,202 @@
+"""The C-arm's intrinsics as degrees of freedom: derivatives, recovery of a wrong file, what is not known, and doubt."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from registration_scenes import CARM, REFERENCE_POINTS, float64, make_scene, off, true_poses
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import CameraChange, Poses, Uncertainty, rigid
+from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.covariance import pose_covariance
+from femoreg_torch.registration.doubts import doubts_about_the_carm
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import image_costs, image_quadratic, stage_objective
+from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance
+from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, moved, reference_point_in_view
+from femoreg_torch.registration.stage import BodyPlan, Stage, run_stage
+from femoreg_torch.similarity import GradNcc
+
+_LEVEL = Level(pixel_mm=3.0, step_mm=1.0)
+_SIMILARITY = GradNcc(patch_radius=5)
+_SCALE = float64(0.02, 0.02, 0.02, 1.0, 1.0, 4.0)
+_ALL = tuple(REFERENCE_POINTS)
+_MOVES = ([1.0, 1, 1], [1.0, 1, 4])
+
+
+def _wrong(scene: Scene, factor: float, shift_mm: tuple[float, float] = (0.0, 0.0)) -> Scene:
+    """The scene with a C-arm's file that is wrong."""
+    return replace(scene, carm=replace(CARM, camera=CARM.camera.changed(CameraChange(factor, shift_mm))))
+
+
+def _stage(doubt: float | None = None, iterations: int = 8) -> Stage:
+    bodies = [BodyPlan([name], *_MOVES) for name in REFERENCE_POINTS] + [BodyPlan(["views"], *_MOVES)]
+    bodies += [BodyPlan(["intrinsics"], doubt=doubt)]
+    optimiser = LevenbergMarquardt(max_iterations=iterations, tol_x=0.01, tol_f=1e-7)
+    return Stage("all", "all", ["all"], ["all"], bodies, _LEVEL, _SIMILARITY, optimiser)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(true_poses())
+
+
+def test_the_gradient_by_the_intrinsics_is_the_slope_of_the_values(scene: Scene) -> None:
+    poses = true_poses()
+    for name, point in REFERENCE_POINTS.items():
+        poses = poses.with_object(name, off(poses.camera1_from[name], point, (0.5, -0.4, 0.6), (0.5, 0.4, -2)))
+    poses = poses.with_changes((CameraChange(1.01, (1.0, -0.5)),) * 3)
+    body = Body(("pelvis",), 0, reference_point_in_view(scene, poses, "pelvis", 0), _SCALE)
+    bodies: tuple[Moving, ...] = (body, intrinsics_of(scene, poses, _ALL))
+    images = [("device", view) for view in range(3)]
+    level = Level(pixel_mm=3.0, step_mm=0.25)  # a slide along coarse steps is rough
+    costs = image_costs(scene, poses, bodies, tuple(REFERENCE_POINTS), images, level, _SIMILARITY)
+    objective = stage_objective(costs, bodies, None)
+    delta = 0.2 * torch.randn(13, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    model = objective.quadratic(delta)
+    h = 0.1
+    steps = h * torch.eye(13, dtype=torch.float64)
+    slope = (objective(delta + steps) - objective(delta - steps)) / (2 * h)
+    assert abs(model.value - float(objective(delta[None])[0])) < 1e-7
+    assert (model.gradient[6:] - slope[6:]).norm() < 0.1 * slope[6:].norm()
+    assert abs(float(model.gradient[6] - slope[6])) < 0.1 * abs(float(slope[6]))
+
+
+def test_a_slide_leaves_the_reference_point_where_it_is_seen(scene: Scene) -> None:
+    poses = true_poses()
+    refined = intrinsics_of(scene, poses, _ALL)
+    after = moved(poses, (refined,), float64(1.5, 1, -1, 0.5, 0, 0, 2))
+    assert after.changes[1].sdd_factor == pytest.approx(1.0304545)  # exp(1.5 · 2 %)
+    for view in range(3):
+        pixels = [
+            scene.camera(p, view).matrix() @ reference_point_in_view(scene, p, "pelvis", view) for p in (poses, after)
+        ]
+        first, second = (p[:2] / p[2] for p in pixels)
+        torch.testing.assert_close(first, second, atol=1e-9, rtol=0)
+
+
+def test_a_wrong_source_distance_is_recovered(scene: Scene) -> None:
+    factor = 1.03
+    wrong, start = _wrong(scene, factor), _slid(scene, factor)
+    fixed = replace(_stage(), bodies=_stage().bodies[:-1])
+    held = run_stage(wrong, start, fixed, (0, 1, 2), 0).poses
+    refined = run_stage(wrong, held, _stage(), (0, 1, 2), 0).poses
+    assert refined.changes[0].sdd_factor * factor == pytest.approx(1.0, abs=0.01)
+    assert _apart(refined) < 0.5 * _apart(held)
+
+
+def _slid(scene: Scene, factor: float) -> Poses:
+    """Where a file that says `factor` times the source distance puts everything by the size in which it is seen."""
+    delta = float64(math.log(factor) / 0.02, *[0.0] * 6)
+    return replace(moved(true_poses(), (intrinsics_of(scene, true_poses(), _ALL),), delta), changes=())
+
+
+def _apart(poses: Poses) -> float:
+    """By how many mm the device is in a wrong place beside the pelvis, along the depth."""
+    truth = true_poses()
+    device, pelvis = ((poses.camera1_from[name] - truth.camera1_from[name])[2, 3] for name in ("device", "pelvis"))
+    return abs(float(device - pelvis))
+
+
+def test_a_right_file_is_not_doubted_and_stays(scene: Scene) -> None:
+    assert run_stage(scene, true_poses(), _stage(doubt=2.5, iterations=1), (0, 1, 2), 0).poses.changes == ()
+
+
+def test_a_wrong_file_is_doubted(scene: Scene) -> None:
+    wrong = _wrong(scene, 1.04)
+    assert run_stage(wrong, _slid(scene, 1.04), _stage(doubt=2.5, iterations=1), (0, 1, 2), 0).poses.changes != ()
+
+
+def test_a_file_that_is_not_doubted_changes_nothing(scene: Scene) -> None:
+    """The images are asked once all else has settled: until then the stage is that without the intrinsics."""
+    aside = true_poses()
+    for name in aside.camera1_from:
+        aside = aside.with_object(name, rigid(translation=float64(1.5, -1, 2)) @ aside.camera1_from[name])
+    waiting = run_stage(scene, aside, _stage(doubt=2.5), (0, 1, 2), 0)
+    without = run_stage(scene, aside, replace(_stage(), bodies=_stage().bodies[:-1]), (0, 1, 2), 0)
+    assert waiting.poses.changes == ()
+    assert waiting.evaluations == without.evaluations
+    for name, pose in without.poses.camera1_from.items():
+        assert torch.equal(waiting.poses.camera1_from[name], pose)
+    assert torch.equal(waiting.poses.camera_from_camera1, without.poses.camera_from_camera1)
+
+
+def test_a_stage_that_goes_on_with_free_intrinsics_counts_both_parts(scene: Scene) -> None:
+    wrong, start = _wrong(scene, 1.04), _slid(scene, 1.04)
+    record = run_stage(wrong, start, _stage(doubt=2.5, iterations=1), (0, 1, 2), 0)
+    assert record.evaluations == 4  # a start and a step each
+    counted = [moment.evaluations for moment in record.moments]
+    assert counted == sorted(counted)
+    assert counted[-1] <= record.evaluations
+
+
+def test_what_the_file_holds_does_not_move(scene: Scene) -> None:
+    held = replace(scene, carm=replace(CARM, uncertainty=Uncertainty(sdd_percent=0.0, principal_point_mm=1.0)))
+    refined = intrinsics_of(held, true_poses(), _ALL)
+    assert refined.free.tolist() == [1, 2, 3, 4, 5, 6]
+    assert refined.changes(torch.ones(6, dtype=torch.float64))[0] == CameraChange(1.0, (1.0, 1.0))
+
+
+def test_the_covariance_grows_with_what_is_not_known_of_the_carm(scene: Scene) -> None:
+    found = []
+    for percent, mm in ((0.0, 0.0), (0.1, 0.1), (2.0, 2.0)):
+        unsure = replace(scene, carm=replace(CARM, uncertainty=Uncertainty(percent, mm)))
+        covariance = pose_covariance(unsure, true_poses(), _LEVEL, _SIMILARITY)
+        torch.testing.assert_close(covariance.matrix, covariance.matrix.T)
+        assert torch.linalg.eigvalsh(covariance.matrix).min() > -1e-9
+        assert min(covariance.deviations("pelvis")[1]) > 0
+        found.append(covariance)
+    depths = [covariance.deviations("pelvis")[1][2] for covariance in found]
+    beside = [covariance.relative_mm("device", "pelvis")[2] for covariance in found]
+    assert depths[0] == pytest.approx(found[0].by_images("pelvis")[1][2])
+    assert depths[0] < depths[1] < depths[2]
+    assert beside[0] < beside[1] < beside[2] < depths[2]
+    assert found[0].relative_mm("pelvis", "pelvis") == [0, 0, 0]
+
+
+def test_a_file_far_from_what_the_images_fit_is_told(scene: Scene) -> None:
+    """Ten per cent where two are allowed for, after a refinement that found the right distance."""
+    wrong = _wrong(scene, 1.10)
+    poses = true_poses().with_changes((CameraChange(1 / 1.10),) * 3)
+    covariance = final_covariance(wrong, poses)
+    (doubt,) = doubts_about_the_carm(wrong, covariance, Limits())
+    assert "the C-arm's file says 1122 mm" in doubt
+    assert "a source distance of 10" in doubt
+    camera = assess_cameras(wrong, poses, covariance)[0]
+    assert camera.sdd_mm == pytest.approx(1020)
+    assert 0 < camera.sdd_deviation_mm < 0.02 * 1020
+    assert doubts_about_the_carm(scene, final_covariance(scene, true_poses()), Limits()) == ()
+
+
+def test_a_wrong_file_that_was_not_refined_is_not_trusted(scene: Scene) -> None:
+    wrong = _wrong(scene, 1.05)
+    end = run_stage(wrong, _slid(scene, 1.05), replace(_stage(), bodies=_stage().bodies[:-1]), (0, 1, 2), 0)
+    assert not assess(wrong, end.poses, Limits())["device"].trusted
+
+
+def test_words_of_a_preset_are_checked() -> None:
+    with pytest.raises(InputError, match="takes `doubt` alone"):
+        BodyPlan(["intrinsics"], [1, 1, 1], [1, 1, 1])
+    with pytest.raises(InputError, match="`doubt` is for"):
+        BodyPlan(["pelvis"], [1, 1, 1], [1, 1, 1], doubt=2)
+    with pytest.raises(InputError, match="needs `images: all`"):
+        replace(_stage(), images="first")
+
+
+def test_the_quadratic_of_the_images_has_no_prior(scene: Scene) -> None:
+    poses = true_poses().with_changes((CameraChange(1.02),) * 3)
+    bodies: tuple[Moving, ...] = (intrinsics_of(scene, poses, _ALL),)
+    costs = image_costs(scene, poses, bodies, ("pelvis",), [("anatomy", 0)], _LEVEL, _SIMILARITY)
+    model = stage_objective(costs, bodies, None).quadratic(costs.still)
+    plain = image_quadratic(costs, costs.still)
+    assert float(model.gradient[0] - plain.gradient[0]) > 0  # the penalty pulls back to the file
+
+
+def test_what_is_not_drawn_does_not_slide(scene: Scene) -> None:
+    """A device that has not been looked for yet stays at its nominal pose."""
+    refined = intrinsics_of(scene, true_poses(), ("pelvis", "femur"))
+    after = moved(true_poses(), (refined,), float64(1.0, *[0.0] * 6))
+    assert torch.equal(after.camera1_from["device"], true_poses().camera1_from["device"])
+    assert not torch.equal(after.camera1_from["femur"], true_poses().camera1_from["femur"])

@@ -1,0 +1,179 @@
+"""A coarse procedure under all conditions: the patient's rays are cast once, and cases tell what they are meant to."""
+
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from femoreg_torch.case import read_case
+from femoreg_torch.case.femoroplasty import device_of
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import plain
+from femoreg_torch.fluoro import read_image
+from femoreg_torch.geometry import load_carm, rotation_angle, transform_points
+from femoreg_torch.volume import read_mesh
+from sim.commands import phantom
+from sim.study import conditions as module
+from sim.study.cases import Stores
+from sim.study.conditions import Condition, Imaged, image_procedure, make_conditions, read_conditions
+from sim.study.procedures import Procedure, Study, load_study
+from sim.theatre.case_folders import write_simulation
+from sim.theatre.metal import draw_materials
+from sim.theatre.preoperative_case import read_preoperative
+from sim.theatre.procedure import draw_procedure
+from sim.theatre.settings import load_simulation
+
+PROCEDURE = Procedure(number=1, patient="somebody", side="right", seed=2)
+CONDITIONS = read_conditions("conditions")
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory: pytest.TempPathFactory) -> Stores:
+    """A coarse patient where both scans of a subject would stand, with a device of the procedure's seed."""
+    root = tmp_path_factory.mktemp("study")
+    stores = Stores(root / "cases", root / "patients", root / "data")
+    folder = stores.patients / "somebody"
+    phantom(folder / "1.0", seed=PROCEDURE.seed, side="right", spacing_mm=2.0)
+    shutil.copytree(folder / "1.0", folder / "0.5")
+    return stores
+
+
+@pytest.fixture(scope="module")
+def study(stores: Stores) -> Study:
+    """That of the accuracy study, with 16 × 16 pixels of the C-arm in one."""
+    folder = stores.cases.parent
+    carm = load_carm("cios_fusion")
+    settings = asdict(carm.camera.downsampled(16)) | {"isocentre_mm": carm.isocentre_mm}
+    (folder / "carm.yaml").write_text(yaml.safe_dump(plain(settings)), encoding="utf-8")
+    content = {"extends": "paper", "carm": str(folder / "carm.yaml"), "acquisition": {"step_mm": 1.0}}
+    (folder / "coarse.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    return replace(load_study("accuracy"), acquisition=str(folder / "coarse.yaml"))
+
+
+@pytest.fixture(scope="module")
+def imaged(stores: Stores, study: Study) -> Imaged:
+    out = Imaged(stores.cases.parent / "bodies", stores.cases.parent / "conditions")
+    image_procedure(PROCEDURE, CONDITIONS, study, stores, out, lambda _: None)
+    return out
+
+
+def folder_of(imaged: Imaged, name: str) -> Path:
+    return imaged.conditions / name / PROCEDURE.name
+
+
+def shown(imaged: Imaged, name: str, kind: str = "device", view: int = 0) -> torch.Tensor:
+    return read_image(read_case(folder_of(imaged, name)).views[view].images[kind]).float()
+
+
+def test_the_condition_uniform_is_the_study_bit_for_bit(
+    imaged: Imaged, stores: Stores, study: Study, tmp_path: Path
+) -> None:
+    coarse, finer = (stores.patients / "somebody" / name for name in ("1.0", "0.5"))
+    write_simulation(coarse, tmp_path / "case", 2, "right", study.acquisition, lambda _: None, finer)
+    for name in ("view1.tif", "view3.tif", "view2_device.tif", "truth.json", "case.yaml", "device.stl"):
+        assert (tmp_path / "case" / name).read_bytes() == (folder_of(imaged, "uniform") / name).read_bytes()
+
+
+def test_every_condition_has_its_case(imaged: Imaged) -> None:
+    assert {path.name for path in imaged.conditions.iterdir()} == {condition.name for condition in CONDITIONS}
+    for condition in CONDITIONS:
+        if condition.told.parts:
+            continue  # read by the library once it knows parts
+        case = read_case(folder_of(imaged, condition.name))
+        assert case.truth is not None
+        assert set(case.truth.camera1_from) == {"pelvis", "femur", "device"}
+        for view in case.views:
+            assert set(view.images) == {"anatomy", "device"} if condition.told.device_images else {"anatomy"}
+
+
+def test_the_rays_through_the_patient_are_cast_once_and_again_where_it_moved(
+    imaged: Imaged, stores: Stores, study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert len(list((imaged.bodies / PROCEDURE.name).glob("*.pt"))) == 6
+    monkeypatch.delattr(module, "areal_posed_tissue")  # nothing is cast any more
+    later = Condition("later", xray={"kvp": 90})
+    image_procedure(PROCEDURE, [later], study, stores, imaged, lambda _: None)
+    assert shown(imaged, "later").shape == (96, 96)
+    again = replace(imaged, conditions=imaged.conditions.parent / "again")
+    make_conditions([PROCEDURE], [CONDITIONS[0]], study, stores, again, 1)
+    name = "view2_device.tif"
+    assert (folder_of(again, "uniform") / name).read_bytes() == (folder_of(imaged, "uniform") / name).read_bytes()
+
+
+def test_mixed_devices_are_told_as_one_or_by_their_parts(imaged: Imaged) -> None:
+    assert torch.equal(shown(imaged, "mixed", "anatomy"), shown(imaged, "uniform", "anatomy"))
+    assert not torch.equal(shown(imaged, "mixed"), shown(imaged, "uniform"))
+    device = device_of(read_case(folder_of(imaged, "mixed")))
+    assert device is not None
+    assert device.model.hu == 5000
+    told = {}
+    for name in ("mixed", "mixed_named", "mixed_wrong"):
+        folder = folder_of(imaged, name)
+        told[name] = yaml.safe_load((folder / "case.yaml").read_text(encoding="utf-8"))["device"]
+        assert (folder / "view1_device.tif").read_bytes() == (
+            folder_of(imaged, "mixed") / "view1_device.tif"
+        ).read_bytes()
+    named, wrong = told["mixed_named"]["parts"], told["mixed_wrong"]["parts"]
+    assert set(told["mixed_named"]) == {"parts", "points", "camera1_from_device"}
+    assert {part["model"].removesuffix(".stl"): part["material"] for part in named} == draw_materials(2)
+    assert all(one["material"] != other["material"] for one, other in zip(named, wrong, strict=True))
+    folder = folder_of(imaged, "mixed_named")
+    volume = sum(read_mesh(folder / part["model"]).volume for part in named)
+    assert np.isclose(volume, read_mesh(folder / "device.stl").volume, rtol=0.005)
+
+
+def test_masks_hide_the_rim_and_table_parts_darken_both_images(imaged: Imaged) -> None:
+    for name in ("round_mask", "square_mask"):
+        share = shown(imaged, name, "anatomy") / shown(imaged, "uniform", "anatomy")
+        assert share[0, 0] < 0.2
+        assert share[40:56, 40:56].mean() > 0.6  # less scatter
+    for kind in ("anatomy", "device"):
+        share = shown(imaged, "table_parts", kind) / shown(imaged, "uniform", kind)
+        assert share.min() < 0.5
+        assert 0.9 < share.median() < 1.02
+
+
+def test_the_focal_length_is_told_wrong_and_nothing_else(imaged: Imaged) -> None:
+    true = read_case(folder_of(imaged, "uniform")).carm
+    for name, factor in (("focal_3", 1.03), ("focal_10", 1.1)):
+        told = read_case(folder_of(imaged, name)).carm
+        camera = replace(true.camera, sdd_mm=true.camera.sdd_mm * factor)
+        assert told.camera.sdd_mm == pytest.approx(camera.sdd_mm)
+        assert replace(told, camera=true.camera) == true
+        assert (told.camera.pixel_mm, told.camera.principal_point_px) == (
+            true.camera.pixel_mm,
+            true.camera.principal_point_px,
+        )
+        assert torch.equal(shown(imaged, name), shown(imaged, "uniform"))
+
+
+def test_the_patient_moves_by_just_so_much_between_the_images(stores: Stores, tmp_path: Path) -> None:
+    paper = load_simulation("paper")
+    known = read_preoperative(stores.patients / "somebody" / "1.0", "right", 2, paper, tmp_path / "device.stl")
+    mesh = read_mesh(known.device.model.path)
+    moving = replace(paper.acquisition, moved_deg=1.0, moved_mm=2.0)
+    still, moved = (
+        draw_procedure(known, mesh, settings, torch.Generator().manual_seed(5))
+        for settings in (paper.acquisition, moving)
+    )
+    assert still.lps_moved is None
+    assert moved.lps_moved is not None
+    assert torch.rad2deg(rotation_angle(moved.lps_moved[:3, :3])).item() == pytest.approx(1)
+    head = known.head[None]
+    assert (transform_points(moved.lps_moved, head) - head).norm().item() == pytest.approx(2)
+    assert torch.equal(still.camera_from_device, moved.camera_from_device)
+
+
+def test_another_condition_of_a_name_and_an_unknown_name_are_refused(
+    imaged: Imaged, stores: Stores, study: Study
+) -> None:
+    other = Condition("uniform", xray={"kvp": 60})
+    with pytest.raises(InputError, match="other settings"):
+        image_procedure(PROCEDURE, [other], study, stores, imaged, lambda _: None)
+    with pytest.raises(InputError, match="no 'fog'"):
+        read_conditions("conditions", ["fog"])
+    assert [condition.name for condition in read_conditions("conditions", ["moved", "dark"])] == ["dark", "moved"]

@@ -1,0 +1,108 @@
+"""Devices of several materials: their parts fill the device, and are imaged at their own densities."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import centred_camera, rigid
+from femoreg_torch.volume.materials import DENSITIES
+from sim.physics.line_integrals import areal_solids, device_density, solid_of, together
+from sim.theatre.device import PARTS, make_device, make_device_parts
+from sim.theatre.metal import draw_materials, metal_in_beam, table_solids
+from sim.theatre.settings import load_simulation
+
+CAMERA = centred_camera(1000.0, (3.0, 3.0), (96, 96))
+POSE = rigid(translation=torch.tensor([0.0, 0.0, 600.0], dtype=torch.float64))
+
+
+@pytest.fixture(scope="module")
+def acquisition():
+    return load_simulation("paper").acquisition
+
+
+@pytest.mark.parametrize("seed", [0, 1, 301, 1002])
+def test_parts_are_closed_disjoint_and_fill_the_device(seed: int) -> None:
+    device, parts = make_device(seed)[0], make_device_parts(seed)
+    assert set(parts) == set(PARTS)
+    assert all(part.is_volume for part in parts.values())
+    volume = sum(part.volume for part in parts.values())
+    assert volume == pytest.approx(device.volume, rel=0.005)
+    whole = trimesh.boolean.union(list(parts.values()))
+    assert whole.volume == pytest.approx(volume, rel=1e-6)  # so no two of them overlap
+    assert trimesh.boolean.union([whole, device]).volume == pytest.approx(volume, rel=1e-6)  # nor does one stand out
+    assert np.allclose(whole.bounds, device.bounds)
+
+
+def test_the_sleeve_has_its_flange_and_the_arm_its_knob() -> None:
+    parts = make_device_parts(1)
+    points = make_device(1)[1]
+    assert parts["sleeve"].bounds[1, 2] == pytest.approx(points["tip"][2].item())
+    assert parts["sleeve"].extents[0] > 13  # wider than any tube: the flange
+    assert parts["arm"].bounds[1, 1] == pytest.approx(22, abs=1)  # where the knob ends
+
+
+def test_materials_belong_to_the_seed_and_differ() -> None:
+    assert draw_materials(3) == draw_materials(3)
+    drawn = [draw_materials(seed) for seed in range(200)]
+    assert {materials["sleeve"] for materials in drawn} == {"steel", "titanium", "cobalt chromium"}
+    others = [{material for name, material in materials.items() if name != "sleeve"} for materials in drawn]
+    assert set.union(*others) == {"steel", "titanium", "aluminium", "pmma", "peek"}
+    assert min(map(len, others)) == 2
+
+
+def test_parts_of_one_material_weigh_what_the_device_weighs() -> None:
+    """All parts of steel are the whole device of steel, up to voxels at the faces where parts meet."""
+    device, parts = make_device(1)[0], make_device_parts(1)
+    apart = areal_solids([solid_of(part, "steel", 0.5) for part in parts.values()], POSE, CAMERA, 0.5)
+    whole = areal_solids([solid_of(device, "steel", 0.5)], POSE, CAMERA, 0.5)
+    assert set(apart) == {"steel"}
+    assert apart["steel"].sum().item() == pytest.approx(whole["steel"].sum().item(), rel=2e-3)
+    assert (apart["steel"] - whole["steel"]).abs().mean() < 0.02 * whole["steel"].mean()
+
+
+def test_a_block_has_the_density_of_its_material() -> None:
+    block = trimesh.creation.box((40, 40, 20))
+    areal = areal_solids([solid_of(block, "aluminium", 0.5)], POSE, CAMERA, 0.25)["aluminium"]
+    assert areal[47:49, 47:49].mean().item() == pytest.approx(2.0 * DENSITIES["aluminium"], rel=2e-3)
+
+
+def test_as_the_presets_say_the_device_is_titanium_alone(acquisition) -> None:
+    mesh, _ = make_device(2)
+    metal = metal_in_beam(mesh, 2, acquisition)
+    assert metal.table == []
+    (solid,) = metal.device
+    assert solid.material == "titanium"
+    assert torch.equal(solid.density.data, device_density(mesh, acquisition.step_mm, 5000).data)
+
+
+def test_a_mixed_device_is_that_of_its_seed(acquisition) -> None:
+    mesh, _ = make_device(2)
+    mixed = replace(acquisition, device_materials="mixed")
+    metal = metal_in_beam(mesh, 2, mixed)
+    assert [solid.material for solid in metal.device] == list(draw_materials(2).values())
+    for solid in metal.device:
+        assert solid.density.data.max().item() == pytest.approx(DENSITIES[solid.material], rel=1e-5)
+    with pytest.raises(InputError, match="seed 3"):
+        metal_in_beam(mesh, 3, mixed)
+
+
+def test_parts_of_the_table_are_seen_in_the_first_view(acquisition) -> None:
+    camera = centred_camera(1020.0, (298 / 96, 298 / 96), (96, 96))
+    here = torch.eye(4, dtype=torch.float64)
+    for seed in range(3):
+        areal = areal_solids(table_solids(seed, 1.0), here, camera, 1.0)
+        assert set(areal) == {"steel", "aluminium"}
+        assert (areal["steel"] > 0).any(1).all()  # the wire crosses every row
+        assert (areal["aluminium"] > 1).sum() > 20
+
+
+def test_what_is_together_adds_up_by_material() -> None:
+    one, two = torch.rand(2, 4, 4)
+    found = together({"water": one}, {"steel": two}, {"steel": one})
+    assert list(found) == ["water", "steel"]
+    assert torch.equal(found["water"], one)
+    assert torch.equal(found["steel"], two + one)

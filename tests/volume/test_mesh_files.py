@@ -1,0 +1,95 @@
+"""CAD files: bodies by name, and mm whatever the unit of the file."""
+
+from pathlib import Path
+from zipfile import ZipFile
+
+import numpy as np
+import pytest
+import trimesh
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.volume import bounds_of, read_bodies, read_mesh
+
+HANDLE = trimesh.creation.box((20, 10, 30))
+SLEEVE = trimesh.creation.annulus(3, 5, 80)
+PLACE = trimesh.transformations.translation_matrix([25, 0, 7])  # of the sleeve, by the file's scene
+
+
+def scene() -> trimesh.Scene:
+    made = trimesh.Scene()
+    made.add_geometry(HANDLE, geom_name="handle", node_name="handle")
+    made.add_geometry(SLEEVE, geom_name="sleeve", node_name="sleeve", transform=PLACE)
+    return made
+
+
+def write(path: Path, unit_mm: float = 1.0) -> Path:
+    scene().scaled(1 / unit_mm).export(path)
+    return path
+
+
+def check_bodies(bodies: dict[str, trimesh.Trimesh]) -> None:
+    assert list(bodies) == ["sleeve", "handle"]
+    assert np.allclose(bodies["handle"].bounds, HANDLE.bounds, atol=1e-3)
+    assert np.allclose(bodies["sleeve"].bounds, SLEEVE.copy().apply_transform(PLACE).bounds, atol=1e-3)
+    assert bodies["sleeve"].volume == pytest.approx(SLEEVE.volume, rel=1e-4)
+
+
+@pytest.mark.parametrize(("suffix", "unit_mm"), [("3mf", 1.0), ("obj", 1.0), ("glb", 1000.0)])
+def test_bodies_come_by_name_in_mm(tmp_path: Path, suffix: str, unit_mm: float) -> None:
+    path = write(tmp_path / f"device.{suffix}", unit_mm)
+    check_bodies(read_bodies(path, ["sleeve", "handle"]))
+    whole = read_mesh(path)
+    assert whole.volume == pytest.approx(HANDLE.volume + SLEEVE.volume, rel=1e-4)
+    assert np.allclose(whole.extents, [40, 10, 80], atol=1e-2)
+
+
+def test_a_3mf_file_tells_its_unit(tmp_path: Path) -> None:
+    written = write(tmp_path / "written.3mf", 25.4)
+    with ZipFile(written) as old, ZipFile(tmp_path / "device.3mf", "w") as new:
+        for name in old.namelist():  # trimesh writes mm
+            new.writestr(name, old.read(name).replace(b'unit="millimeter"', b'unit="inch"'))
+    check_bodies(read_bodies(tmp_path / "device.3mf", ["sleeve", "handle"]))
+
+
+@pytest.mark.parametrize("before", ["", "o device\n"])
+def test_groups_of_an_obj_file_are_bodies(tmp_path: Path, before: str) -> None:
+    """Also where they stand within a single object, and where the materials of a renderer run across them."""
+    write(tmp_path / "objects.obj")
+    text = (tmp_path / "objects.obj").read_text().replace("\no ", "\ng ")
+    lines = [f"usemtl {line[2:]}\n{line}" if line.startswith("g ") else line for line in text.splitlines()]
+    (tmp_path / "device.obj").write_text(before + "\n".join(lines))
+    check_bodies(read_bodies(tmp_path / "device.obj", ["sleeve", "handle"]))
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["sleeve"], r"device\.3mf: handle has no material\. Name .*; the file has: handle, sleeve\.$"),
+        (["sleeve", "handle", "knob"], r"device\.3mf: knob is not in the file\. .* the file has: handle, sleeve\.$"),
+        (["sleeve", "grip"], r"device\.3mf: grip is not in the file and handle has no material"),
+    ],
+)
+def test_all_bodies_are_named(tmp_path: Path, names: list[str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_bodies(write(tmp_path / "device.3mf"), names)
+
+
+def test_an_open_body_is_named(tmp_path: Path) -> None:
+    made = scene()
+    made.geometry["sleeve"].update_faces(np.arange(len(SLEEVE.faces)) > 0)
+    made.export(tmp_path / "device.3mf")
+    with pytest.raises(InputError, match=r"device\.3mf, body sleeve: the mesh is open"):
+        read_bodies(tmp_path / "device.3mf", ["sleeve", "handle"])
+
+
+@pytest.mark.parametrize("factor", [0.001, 0.0393, 1000])
+def test_a_device_of_an_unlikely_size_is_refused(factor: float) -> None:
+    with pytest.raises(InputError, match=r"device\.stl: its longest edge is .* mm, but .* is to be in mm"):
+        bounds_of([HANDLE.copy().apply_scale(factor)], "device.stl")
+    assert bounds_of([HANDLE], "device.stl").tolist() == HANDLE.bounds.tolist()
+
+
+def test_step_says_what_to_export(tmp_path: Path) -> None:
+    (tmp_path / "device.STEP").write_text("ISO-10303-21;")
+    with pytest.raises(InputError, match=r"device\.STEP: is a STEP file\. Export it as STL, or as 3MF"):
+        read_mesh(tmp_path / "device.STEP")
