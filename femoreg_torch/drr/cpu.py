@@ -1,8 +1,8 @@
 """The projector on the CPU: compiled by numba, on all cores, with empty-space skipping for packets of rays.
 
 All kernels walk the rays of one volume in the same way. A ray is `source + t · direction` in padded index space, t mm
-from the X-ray source; samples lie at whole multiples of the step, so that neither the batch nor the place of the volume
-moves them. The detector is cut into square packets, small enough that all rays of one stay within SPREAD voxels of its
+from the X-ray source; samples lie at whole multiples of the step of the pose (`drr.sampling`), whatever else is in the
+batch. The detector is cut into square packets, small enough that all rays of one stay within SPREAD voxels of its
 middle. The middle ray alone finds the runs of samples that may see something; every ray of the packet then takes them.
 """
 
@@ -195,14 +195,14 @@ def _first_packet(principal, edge):  # type: ignore[no-untyped-def]
 
 # Kernels: poses × packets, shared out among the cores ----------------------------------------------------------------
 @_parallel
-def _forward(padded, leap, affines, detector, step, edges, workers, out):  # type: ignore[no-untyped-def]
+def _forward(padded, leap, affines, detector, steps, edges, workers, out):  # type: ignore[no-untyped-def]
     poses, rows, columns = out.shape
     flat = padded.reshape(-1)
     height, width = padded.shape[1], padded.shape[2]
     for worker in nb.prange(workers):
         starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
         for pose in range(poses):
-            affine, edge = affines[pose], edges[pose]
+            affine, step, edge = affines[pose], steps[pose], edges[pose]
             source = affine[:, 3]
             first_top, first_left = _first_packet(detector[4], edge), _first_packet(detector[3], edge)
             bands = -(-(rows - first_top) // edge)
@@ -225,14 +225,14 @@ def _forward(padded, leap, affines, detector, step, edges, workers, out):  # typ
 
 
 @_parallel
-def _with_moments(padded, leap, affines, detector, step, edges, workers, image, moments):  # type: ignore[no-untyped-def]
+def _with_moments(padded, leap, affines, detector, steps, edges, workers, image, moments):  # type: ignore[no-untyped-def]
     poses, rows, columns = image.shape
     flat = padded.reshape(-1)
     height, width = padded.shape[1], padded.shape[2]
     for worker in nb.prange(workers):
         starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
         for pose in range(poses):
-            affine, edge = affines[pose], edges[pose]
+            affine, step, edge = affines[pose], steps[pose], edges[pose]
             source = affine[:, 3]
             first_top, first_left = _first_packet(detector[4], edge), _first_packet(detector[3], edge)
             bands = -(-(rows - first_top) // edge)
@@ -265,14 +265,14 @@ def _with_moments(padded, leap, affines, detector, step, edges, workers, image, 
 
 
 @_parallel
-def _scatter(affines, detector, step, workers, upstream, parts):  # type: ignore[no-untyped-def]
+def _scatter(affines, detector, steps, workers, upstream, parts):  # type: ignore[no-untyped-def]
     poses, rows, columns = upstream.shape
     shape = parts.shape[1:]
     for worker in nb.prange(workers):
         mine = parts[worker]
         for line in range(worker, poses * rows, workers):
             pose, row = line // rows, line % rows
-            affine = affines[pose]
+            affine, step = affines[pose], steps[pose]
             source = affine[:, 3]
             for column in range(columns):
                 share = step * upstream[pose, row, column]
@@ -315,33 +315,33 @@ def _packet_edges(volume: BrickedVolume, affines: Array, camera: Camera) -> NDAr
     return np.clip(1 + (SPREAD * math.sqrt(2) / per_pixel).astype(np.int64), 1, _MOST_RAYS)
 
 
-def projection(volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float) -> NDArray[np.float32]:
-    """Line integrals (B, H, W) of one volume for `affines` (B, 3, 4), index from camera mm."""
+def projection(volume: BrickedVolume, affines: Array, camera: Camera, steps: Array) -> NDArray[np.float32]:
+    """Line integrals (B, H, W) of one volume for `affines` (B, 3, 4), index from camera mm, and steps (B,) mm."""
     edges = _packet_edges(volume, affines, camera)
     image = np.zeros((len(affines), *camera.shape), np.float32)
     padded = _padded_affines(affines)
-    _forward(volume.padded, volume.leap, padded, _detector(camera), step_mm, edges, nb.get_num_threads(), image)
+    _forward(volume.padded, volume.leap, padded, _detector(camera), steps, edges, nb.get_num_threads(), image)
     return image
 
 
 def projection_with_moments(
-    volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float
+    volume: BrickedVolume, affines: Array, camera: Camera, steps: Array
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Line integrals (B, H, W), and the moments (B, H, W, 6) that hold their derivatives (`drr.moments`)."""
     edges = _packet_edges(volume, affines, camera)
     image = np.zeros((len(affines), *camera.shape), np.float32)
     moments = np.zeros((*image.shape, 6), np.float32)
     padded, workers = _padded_affines(affines), nb.get_num_threads()
-    _with_moments(volume.padded, volume.leap, padded, _detector(camera), step_mm, edges, workers, image, moments)
+    _with_moments(volume.padded, volume.leap, padded, _detector(camera), steps, edges, workers, image, moments)
     return image, moments
 
 
 def volume_gradient(
-    volume: BrickedVolume, affines: Array, camera: Camera, step_mm: float, upstream: NDArray[np.float32]
+    volume: BrickedVolume, affines: Array, camera: Camera, steps: Array, upstream: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Gradient (Z, Y, X) of Σ upstream · image with respect to the volume's data; `upstream` is (B, H, W)."""
     workers = nb.get_num_threads()
     parts = np.zeros((workers, *volume.padded.shape), np.float32)
-    _scatter(_padded_affines(affines), _detector(camera), step_mm, workers, upstream, parts)
+    _scatter(_padded_affines(affines), _detector(camera), steps, workers, upstream, parts)
     inside = tuple(slice(RIM, RIM + n) for n in volume.shape)
     return np.ascontiguousarray(parts.sum(0)[inside])

@@ -2,7 +2,8 @@
 
 A sample lies at x = A u t + b in index space, with the unit ray u, the distance t from the source, the affine (A | b).
 For an image I = step · Σ_k V(x_k) the chain rule gives ∂I/∂b = step · Σ ∇V and ∂I/∂A = step · Σ t ∇V uᵀ. So the moments
-(step · Σ ∇V, step · Σ t ∇V), six numbers per pixel, hold every derivative with respect to any pose parameter.
+(step · Σ ∇V, step · Σ t ∇V), six numbers per pixel, hold every derivative with respect to any pose parameter. The step
+itself goes along with the volume (`drr.sampling`): with t = k · step, ∂I/∂log step = I + step · Σ t ∇V · A u.
 """
 
 import torch
@@ -26,6 +27,12 @@ def affine_gradient(moments: Tensor, camera: Camera, upstream: Tensor) -> Tensor
         shift = weighted[:, :3].sum(0, dtype=torch.float64)
         gradients.append(torch.cat([(weighted[:, 3:].mT @ rays).to(torch.float64), shift[:, None]], 1))
     return torch.stack(gradients)
+
+
+def step_gradient(image: Tensor, affines: Tensor, steps: Tensor, upstream: Tensor, by_affines: Tensor) -> Tensor:
+    """Gradient (B,) of Σ upstream · image by the steps (B,), from that by the affines (B, 3, 4)."""
+    stretched = (affines[:, :, :3] * by_affines[:, :, :3]).sum((1, 2))  # Σ upstream · step · Σ t ∇V · A u
+    return ((upstream * image).sum((1, 2), dtype=torch.float64) + stretched) / steps
 
 
 def jacobian(moments: Tensor, camera: Camera, changes: Tensor) -> Tensor:

@@ -11,8 +11,9 @@ from torch.autograd.function import once_differentiable
 
 from femoreg_torch.drr import cpu, cuda
 from femoreg_torch.drr.bricks import bricked
-from femoreg_torch.drr.moments import affine_gradient, jacobian, unit_rays
+from femoreg_torch.drr.moments import affine_gradient, jacobian, step_gradient, unit_rays
 from femoreg_torch.drr.reference import march
+from femoreg_torch.drr.sampling import middle_of, step_rates, steps_of
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry.camera import Camera
 from femoreg_torch.geometry.rigid import skew
@@ -31,8 +32,9 @@ def project(
 
     `camera_from_volume` maps the mm space of the volume (LPS or CAD) into the camera frame: (B, 4, 4) of one volume, or
     (B, V, 4, 4) of a sequence of V volumes.
-    Values are interpolated trilinearly, are zero outside, and are summed at whole multiples of `step_mm` along each ray
-    from the source, times the step. Returns (B, H, W) float32, summed over volumes, or (B, V, H, W) if `separate`.
+    Values are interpolated trilinearly, are zero outside, and are summed along each ray at whole multiples of a step
+    from the source, times the step: `step_mm`, made a little shorter or longer so that a sample lies on the middle of
+    the volume (`drr.sampling`). Returns (B, H, W) float32, summed over volumes, or (B, V, H, W) if `separate`.
 
     Differentiable in `camera_from_volume` and in the volumes' data. Compiled kernels that skip empty space do the work,
     on the device of the volumes: numba's on the CPU, Triton's on CUDA, where poses should be as well, as a copy from
@@ -48,10 +50,7 @@ def project(
             )
         volumes, camera_from_volume = [volumes], camera_from_volume[:, None]
     _check(volumes, camera_from_volume)
-    images = [
-        _project_one(volume, _index_from_camera(volume, camera_from_volume[:, v]), camera, step_mm)
-        for v, volume in enumerate(volumes)
-    ]
+    images = [_project_one(volume, camera_from_volume[:, v], camera, step_mm) for v, volume in enumerate(volumes)]
     if separate:
         return torch.stack(images, 1)
     return functools.reduce(torch.add, images)
@@ -78,29 +77,38 @@ def project_with_jacobian(
     with torch.no_grad():
         index_from_camera = _index_from_camera(volume, camera_from_volume)
         affines = index_from_camera[:, :3]
+        middle = middle_of(volume, camera_from_volume)
+        generators = _twist_generators(centre.to(index_from_camera))
+        velocities = (generators[:, :3, :3] @ middle[:, None, :, None])[..., 0] + generators[:, :3, 3]  # (B, 6, 3)
+        rates = step_rates(middle, velocities, step_mm).to(torch.float32)[:, None, None]
         # To move the object is to move the camera's points in it the other way.
-        changes = -affines[:, None] @ _twist_generators(centre.to(index_from_camera))
-        if intrinsics:
-            changes = torch.cat([changes, affines[:, None] @ _ray_generators(camera).to(index_from_camera)], 1)
-    image, derivatives = _with_derivatives(volume, affines, changes, camera, step_mm)
+        changes = torch.cat(
+            [-affines[:, None] @ generators, affines[:, None] @ _ray_generators(camera).to(index_from_camera)], 1
+        )
+    steps = steps_of(middle, step_mm)
+    image, derivatives = _with_derivatives(volume, affines, changes, camera, steps)
+    moved, turned, stretched = derivatives.split([6, 3, 1], -1)
+    moved = moved + rates * (image[..., None] + stretched)  # as the step goes along
     if not intrinsics:
-        return image, derivatives
-    turned, stretched = derivatives[..., :9], derivatives[..., 9:]
+        return image, moved
     rays = unit_rays(camera).to(image.device)
     shares = torch.einsum("hwi,nij,hwj->hwn", rays, _ray_generators(camera)[:3, :3, :3].to(rays), rays)
-    return image, torch.cat([turned[..., :6], turned[..., 6:] - shares * stretched], -1)
+    return image, torch.cat([moved, turned - shares * stretched], -1)
 
 
 def _with_derivatives(
-    volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, step_mm: float
+    volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, steps: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Images (B, H, W) and their derivatives (B, H, W, n) by parameters that change the affines by (B, n, 3, 4)."""
+    """Images (B, H, W) and their derivatives (B, H, W, n) by parameters that change the affines by (B, n, 3, 4).
+
+    Samples lie at whole multiples of `steps` (B,) mm.
+    """
     if volume.data.device.type == "cpu":
-        image, moments = cpu.projection_with_moments(bricked(volume), affines.numpy(), camera, step_mm)
+        image, moments = cpu.projection_with_moments(bricked(volume), affines.numpy(), camera, steps.numpy())
         return torch.from_numpy(image), jacobian(torch.from_numpy(moments), camera, changes)
     if reason := cuda.why_not(volume):
         raise InputError(f"project_with_jacobian: {reason}. Move the volume to the CPU, or use Triton on CUDA.")
-    return cuda.jacobian(volume, affines, changes, camera, step_mm)
+    return cuda.jacobian(volume, affines, changes, camera, steps)
 
 
 def _twist_generators(centre: Tensor) -> Tensor:
@@ -148,14 +156,16 @@ def _index_from_camera(volume: Volume, camera_from_volume: Tensor) -> Tensor:
     return torch.linalg.inv_ex(camera_from_index, check_errors=device.type == "cpu").inverse
 
 
-def _project_one(volume: Volume, index_from_camera: Tensor, camera: Camera, step_mm: float) -> Tensor:
+def _project_one(volume: Volume, camera_from_volume: Tensor, camera: Camera, step_mm: float) -> Tensor:
+    index_from_camera = _index_from_camera(volume, camera_from_volume)
+    affines, steps = index_from_camera[:, :3], steps_of(middle_of(volume, camera_from_volume), step_mm)
     if volume.data.device.type == "cpu":
-        image: Tensor = _CpuProjection.apply(volume.data, index_from_camera[:, :3], volume, camera, step_mm)
+        image: Tensor = _CpuProjection.apply(volume.data, affines, steps, volume, camera)
         return image
     if reason := cuda.why_not(volume):
         _warn_of_the_march(reason)
-        return march(volume.data, index_from_camera.to(torch.float32), camera, step_mm)
-    return cuda.project(volume, index_from_camera[:, :3], camera, step_mm)
+        return march(volume.data, index_from_camera.to(torch.float32), camera, steps)
+    return cuda.project(volume, affines, camera, steps)
 
 
 @functools.cache
@@ -165,28 +175,29 @@ def _warn_of_the_march(reason: str) -> None:
 
 
 class _CpuProjection(torch.autograd.Function):
-    """The CPU kernels as an autograd function of the volume's data and of index-from-camera affines (B, 3, 4)."""
+    """The CPU kernels as an autograd function of volume data, index-from-camera affines (B, 3, 4), steps (B,)."""
 
     @staticmethod
-    def forward(ctx: Any, data: Tensor, affines: Tensor, volume: Volume, camera: Camera, step_mm: float) -> Tensor:
-        ctx.volume, ctx.camera, ctx.step_mm = volume, camera, step_mm
-        numbers, moments = affines.detach().numpy(), None
+    def forward(ctx: Any, data: Tensor, affines: Tensor, steps: Tensor, volume: Volume, camera: Camera) -> Tensor:
+        ctx.volume, ctx.camera = volume, camera
+        numbers, moments = (affines.detach().numpy(), camera, steps.detach().numpy()), None
         if ctx.needs_input_grad[1]:  # one walk along the rays gives image and derivatives
-            image, moments = cpu.projection_with_moments(bricked(volume), numbers, camera, step_mm)
+            image, moments = map(torch.from_numpy, cpu.projection_with_moments(bricked(volume), *numbers))
         else:
-            image = cpu.projection(bricked(volume), numbers, camera, step_mm)
-        ctx.save_for_backward(affines, None if moments is None else torch.from_numpy(moments))
-        return torch.from_numpy(image)
+            image = torch.from_numpy(cpu.projection(bricked(volume), *numbers))
+        ctx.save_for_backward(affines, steps, image, moments)
+        return image
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        affines, moments = ctx.saved_tensors
+        affines, steps, image, moments = ctx.saved_tensors
         weights = upstream.to(torch.float32)
-        data_gradient = pose_gradient = None
+        by_data = by_affines = by_steps = None
         if ctx.needs_input_grad[0]:
-            numbers = affines.detach().numpy(), ctx.camera, ctx.step_mm, weights.contiguous().numpy()
-            data_gradient = torch.from_numpy(cpu.volume_gradient(bricked(ctx.volume), *numbers))
+            numbers = affines.detach().numpy(), ctx.camera, steps.detach().numpy(), weights.contiguous().numpy()
+            by_data = torch.from_numpy(cpu.volume_gradient(bricked(ctx.volume), *numbers))
         if moments is not None:
-            pose_gradient = affine_gradient(moments, ctx.camera, weights)
-        return data_gradient, pose_gradient, None, None, None
+            by_affines = affine_gradient(moments, ctx.camera, weights)
+            by_steps = step_gradient(image, affines, steps, weights, by_affines)
+        return by_data, by_affines, by_steps, None, None

@@ -2,12 +2,14 @@
 """The projector's kernels in Triton. Importing this module imports Triton; only `cuda.py` does, and only when needed.
 
 One program renders a square tile of rays of one pose. As on the CPU, a ray is `source + t · direction` in padded index
-space, and its samples lie at whole multiples of the step. What decides where a sample lies is computed in float64, once
-per ray; from there on the ray counts in float32 voxels from the voxel it enters by, so that indices of a thousand cost
-no accuracy. All rays of a tile are at the same sample number, and leap together, as far as the one that may leap least.
+space, and its samples lie at whole multiples of the step of the pose. What decides where a sample lies is computed in
+float64, once per ray; from there on the ray counts in float32 voxels from the voxel it enters by, so that indices of a
+thousand cost no accuracy. All rays of a tile are at the same sample number, and leap together, as far as the one that
+may leap least.
 
-Tensors, all contiguous: `affines` (B, 3, 4) float64, padded index from camera mm; `geometry` (6,) float64, see
-`_unit_rays`; `volume` (depth, height, width) in any float type; `leap` uint8, one per brick, see `bricks.py`.
+Tensors, all contiguous: `affines` (B, 3, 4) float64, padded index from camera mm; `geometry` (5,) float64, see
+`_unit_rays`; `steps` (B,) float64, mm; `volume` (depth, height, width) in any float type; `leap` uint8, one per brick,
+see `bricks.py`.
 """
 
 import triton
@@ -45,7 +47,7 @@ def _pixels(rows, columns, tile: tl.constexpr):
 
 @triton.jit
 def _unit_rays(geometry, row, column):
-    """Unit rays in the camera frame. `geometry`: source to detector, row and column spacing, principal point, step."""
+    """Unit rays in the camera frame. `geometry`: source to detector, row and column spacing, principal point."""
     z = tl.load(geometry)
     y = (row - tl.load(geometry + 4)) * tl.load(geometry + 1)
     x = (column - tl.load(geometry + 3)) * tl.load(geometry + 2)
@@ -192,9 +194,9 @@ def _march(volume, leap, first, count, along_x, along_y, along_z, height, width)
 
 
 @triton.jit
-def _moments(volume, leap, affines, geometry, x, y, z, on, depth, height, width):
+def _moments(volume, leap, affines, steps, x, y, z, on, depth, height, width):
     """Per ray, times the step: Σ value, then in float64 Σ slope (3) and Σ t · slope (3), t mm from the source."""
-    step = tl.load(geometry + 5)
+    step = tl.load(steps + tl.program_id(1))
     first, count, along_x, along_y, along_z, fault = _rays(
         affines, tl.program_id(1), step, x, y, z, on, depth, height, width
     )
@@ -211,17 +213,17 @@ _kernel = triton.jit(do_not_specialize=["depth", "height", "width", "rows", "col
 
 
 @_kernel
-def forward(volume, leap, affines, geometry, depth, height, width, rows, columns, image, tile: tl.constexpr):
+def forward(volume, leap, affines, geometry, steps, depth, height, width, rows, columns, image, tile: tl.constexpr):
     """Line integrals `image` (B, H, W) float32."""
     row, column, on, place = _pixels(rows, columns, tile)
     x, y, z = _unit_rays(geometry, row, column)
-    value, _, _, _, _, _, _ = _moments(volume, leap, affines, geometry, x, y, z, on, depth, height, width)
+    value, _, _, _, _, _, _ = _moments(volume, leap, affines, steps, x, y, z, on, depth, height, width)
     tl.store(image + place, value.to(tl.float32), mask=on)
 
 
 @_kernel
 def pose_gradient(
-    volume, leap, affines, geometry, depth, height, width, rows, columns, upstream, parts, tile: tl.constexpr
+    volume, leap, affines, geometry, steps, depth, height, width, rows, columns, upstream, parts, tile: tl.constexpr
 ):
     """Each tile's part of the gradient by `affines`: `parts` (B, tiles, 3, 4) float64, to be summed by the caller.
 
@@ -229,7 +231,7 @@ def pose_gradient(
     """
     row, column, on, place = _pixels(rows, columns, tile)
     x, y, z = _unit_rays(geometry, row, column)
-    _, sx, sy, sz, tx, ty, tz = _moments(volume, leap, affines, geometry, x, y, z, on, depth, height, width)
+    _, sx, sy, sz, tx, ty, tz = _moments(volume, leap, affines, steps, x, y, z, on, depth, height, width)
     weight = tl.load(upstream + place, mask=on, other=0.0)
     part = parts + (tl.program_id(1).to(tl.int64) * tl.num_programs(0) + tl.program_id(0)) * 12
     _store_row(part, weight, sx, tx, x, y, z)
@@ -254,12 +256,26 @@ def _change(changes, row, s, t, x, y, z):
 
 @_kernel
 def jacobian(
-    volume, leap, affines, geometry, depth, height, width, rows, columns, changes, dofs, image, out, tile: tl.constexpr
+    volume,
+    leap,
+    affines,
+    geometry,
+    steps,
+    depth,
+    height,
+    width,
+    rows,
+    columns,
+    changes,
+    dofs,
+    image,
+    out,
+    tile: tl.constexpr,
 ):
     """Line integrals `image` (B, H, W), and their derivatives `out` (B, H, W, dofs) along `changes` (B, dofs, 3, 4)."""
     row, column, on, place = _pixels(rows, columns, tile)
     x, y, z = _unit_rays(geometry, row, column)
-    value, sx, sy, sz, tx, ty, tz = _moments(volume, leap, affines, geometry, x, y, z, on, depth, height, width)
+    value, sx, sy, sz, tx, ty, tz = _moments(volume, leap, affines, steps, x, y, z, on, depth, height, width)
     tl.store(image + place, value.to(tl.float32), mask=on)
     for dof in range(dofs):
         change = changes + (tl.program_id(1) * dofs + dof) * 12
@@ -269,14 +285,16 @@ def jacobian(
 
 
 @_kernel
-def volume_gradient(affines, geometry, depth, height, width, rows, columns, upstream, gradient, tile: tl.constexpr):
+def volume_gradient(
+    affines, geometry, steps, depth, height, width, rows, columns, upstream, gradient, tile: tl.constexpr
+):
     """Add to `gradient` (depth, height, width) float32. Nothing is skipped: what is empty may well have a gradient.
 
     By atomics, in no set order: two runs agree to rounding only.
     """
     row, column, on, place = _pixels(rows, columns, tile)
     x, y, z = _unit_rays(geometry, row, column)
-    step = tl.load(geometry + 5)
+    step = tl.load(steps + tl.program_id(1))
     _, count, along_x, along_y, along_z, fault = _rays(
         affines, tl.program_id(1), step, x, y, z, on, depth, height, width
     )
