@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.drr import project, project_with_jacobian
-from femoreg_torch.drr.moments import unit_rays
 from femoreg_torch.geometry import Camera, Poses, invert_rigid, transform_points
 from femoreg_torch.optimize import Quadratic, SmoothObjective
 from femoreg_torch.registration.imaging import PLAIN, Imaging, tissue_integrals
@@ -157,8 +156,8 @@ class ImageCosts:
             jacobians.append(jacobian[0, ..., :6])
             twists.append(_twists(change, pose, centre))
             for intrinsics, _ in refining:
-                across = _across(intrinsics.slide_rates(target.view, camera.sdd_mm), camera)
-                by_rays = by_rays + jacobian[0, ..., 6:] + (across @ jacobian[0, ..., 3:6, None])[..., 0]
+                sliding = intrinsics.slide_rates(target.view, camera.sdd_mm).to(jacobian.dtype)
+                by_rays = by_rays + jacobian[0, ..., 6:] + jacobian[0, ..., 3:6] @ sliding.T
         for intrinsics, chosen in refining:
             jacobians.append(by_rays)
             twists.append(intrinsics.by_delta(target.view) @ chosen.T)
@@ -176,17 +175,6 @@ class ImageCosts:
         placed = self._placed(target, torch.cat([delta + steps, delta - steps]))  # (2 n, O, 4, 4)
         above, below = placed.chunk(2)
         return ((above - below) / (2 * _STEP)).movedim(0, 1)
-
-
-def _across(rates: Tensor, camera: Camera) -> Tensor:
-    """The parts (H, W, n, 3) of velocities (n, 3) in the camera frame that lie across each ray.
-
-    What moves along a ray does not change its integral. Sums over samples do change a little, and over the long way
-    that a slide goes this would drown the change of perspective.
-    """
-    rates = rates.to(torch.float32)
-    rays = unit_rays(camera)
-    return rates - (rays @ rates.T)[..., None] * rays[..., None, :]
 
 
 def _twists(changes: Tensor, pose: Tensor, centre: Tensor) -> Tensor:
