@@ -291,22 +291,43 @@ def _best_side(
     points: Array, middle: Array, tolerance: float, generator: np.random.Generator, straight: bool
 ) -> tuple[_Circle | _Line | None, Mask]:
     """The circle or line, or line alone, that most of the points (N, 2) lie on, and which; `middle` lies inside."""
+    size = float(np.ptp(points, axis=0).max())
     best: _Circle | _Line | None = None
-    most, size = np.zeros(len(points), bool), float(np.ptp(points, axis=0).max())
+    most = np.zeros(len(points), bool)
     for count in (2,) if straight else (2, 3):
-        for chosen in points[generator.integers(len(points), size=(_TRIES, count))]:
-            side = _line_of(chosen) if count == 2 else _circle_of(chosen)
-            if isinstance(side, _Circle) and not 0.1 * size < side.radius < 2 * size:
-                continue
-            if isinstance(side, _Line) and side.depth(middle) < 0:
-                side = _Line(-side.normal, -side.offset)
-            near = np.abs(side.depth(points)) <= tolerance
-            if near.sum() > most.sum():
-                best, most = side, near
+        chosen = points[generator.integers(len(points), size=(_TRIES, count))]
+        apart = _from_lines(chosen, points) if count == 2 else _from_circles(chosen, points, size)
+        near = apart <= tolerance  # nan, where points coincide, is not near
+        fullest = int(near.sum(1).argmax())
+        if near[fullest].sum() > most.sum():
+            best, most = (_line_of if count == 2 else _circle_of)(chosen[fullest]), near[fullest]
     if best is not None:
+        if isinstance(best, _Line) and best.depth(middle) < 0:
+            best = _Line(-best.normal, -best.offset)
         best = best.refitted(points[most])
         most = np.abs(best.depth(points)) <= 1.5 * tolerance
     return best, most
+
+
+def _from_lines(pairs: Array, points: Array) -> Array:
+    """Distances (T, N) of points (N, 2) from the lines through pairs (T, 2, 2)."""
+    along = pairs[:, 1] - pairs[:, 0]
+    with np.errstate(invalid="ignore"):
+        normals = np.stack([-along[:, 1], along[:, 0]], 1) / np.linalg.norm(along, axis=1, keepdims=True)
+    return np.asarray(np.abs(normals @ points.T - (normals * pairs[:, 0]).sum(1, keepdims=True)))
+
+
+def _from_circles(triples: Array, points: Array, size: float) -> Array:
+    """Distances (T, N) of points (N, 2) from the circles through triples (T, 3, 2); nan for radii unlike `size`."""
+    (ax, ay), (bx, by) = (triples[:, 1] - triples[:, 0]).T, (triples[:, 2] - triples[:, 0]).T
+    a, b = ax**2 + ay**2, bx**2 + by**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        to_middle = np.stack([by * a - ay * b, ax * b - bx * a], 1) / (2 * (ax * by - ay * bx))[:, None]
+        radii = np.linalg.norm(to_middle, axis=1)
+        radii[~((radii > 0.1 * size) & (radii < 2 * size))] = np.nan
+        middles = triples[:, 0] + to_middle
+        squared = (points**2).sum(1) - 2 * middles @ points.T + (middles**2).sum(1)[:, None]
+        return np.asarray(np.abs(np.sqrt(squared.clip(0)) - radii[:, None]))
 
 
 def _line_of(points: Array) -> _Line:

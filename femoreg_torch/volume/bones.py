@@ -84,7 +84,7 @@ def bone_labels(
         mirror = anatomy.bone(name).mirror if anatomy and name in order else name
         if mirror in number and number[mirror] > number[name] and set(table[name]) & set(table[mirror]):
             _part_sides(labels.with_data(found), name, mirror, number, anatomy, landmarks)
-    present = set(found.unique().tolist())
+    present = set(np.flatnonzero(np.bincount(found.numpy().ravel())).tolist())
     return BoneLabels(
         labels.with_data(found),
         {name: n for name, n in number.items() if n in present},

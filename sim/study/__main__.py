@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +16,7 @@ from sim.study import accuracy as measurement
 from sim.study import capture
 from sim.study.cases import Stores, ready
 from sim.study.conditions import Imaged, make_conditions, read_conditions
+from sim.study.conditions_page import write_conditions
 from sim.study.procedures import Procedure, Study, load_study, procedures
 from sim.study.timing import time_register
 from sim.study.trust import sabotaged_runs, write_trust
@@ -176,28 +178,52 @@ def ablation(
 def conditions(
     conditions_file: str = "conditions",
     only: str | None = None,
+    preset: str = "fast",
     first: int | None = None,
     kind: Kind = "all",
     out: Path = _OUT,
     patients: Path | None = None,
     data: Path = _DATA,
     jobs: int = 1,
+    cases_only: bool = False,
+    reuse: bool = False,
+    docs: Path | None = None,
 ) -> None:
-    """Image the procedures under other conditions: OUT/conditions/CONDITION/PROCEDURE; those that are there stay.
+    """Image the procedures under other conditions, register them, and tell the errors under each.
+
+    Cases stand in OUT/conditions/CONDITION/PROCEDURE; those that are there stay.
 
     Args:
         conditions_file: preset of configs/study, or a YAML file of conditions.
         only: names of conditions, with commas in between; all, if not given.
+        preset: registration preset.
         first: only the first so many procedures.
         kind: patients to take.
-        out: folder that holds, or will hold, `conditions/`, and `bodies/`, which later conditions reuse.
+        out: folder of cases and results, and of `bodies/`, which later conditions reuse.
         patients: CTs around real bone shapes; OUT/patients if not given.
         data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
         jobs: procedures at the same time, on one core each; each needs some gigabytes of memory.
+        cases_only: make the cases alone.
+        reuse: take results that are there although code or plan have changed since (those of the same code always are).
+        docs: folder of the page that is to be renewed.
     """
     study, chosen, stores = _chosen(first, kind, out, patients, data)
     wanted = read_conditions(conditions_file, only.split(",") if only else ())
-    make_conditions(chosen, wanted, study, stores, Imaged(out / "bodies", out / "conditions"), jobs)
+    imaged = Imaged(out / "bodies", out / "conditions")
+    make_conditions(chosen, wanted, study, stores, imaged, jobs)
+    if cases_only:
+        return
+    plan = load_plan(preset)
+    folder = out / f"{preset}_conditions"
+    runs = []
+    for condition in wanted:
+        print(condition.name, flush=True)
+        cases = replace(stores, cases=imaged.conditions / condition.name)
+        records = measurement.register_all(chosen, study, cases, plan, folder / condition.name / "runs", jobs, reuse)
+        runs.append((condition, records))
+    command = f"python -m sim.study conditions --preset {preset} --first {len(chosen)}"
+    command += f" --only {only}" if only else ""
+    print(write_conditions(runs, preset, command, folder, docs))
 
 
 def listing(first: int | None = None, kind: Kind = "all", out: Path = _OUT) -> None:

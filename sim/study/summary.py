@@ -84,6 +84,30 @@ def confusion(records: Sequence[Record], name: str | None = None) -> Confusion:
 
 
 @dataclass(frozen=True)
+class Coverage:
+    """Shares of errors within one and two of the standard deviations that the results state, along IS, LR and AP."""
+
+    within_1: tuple[float, ...]
+    within_2: tuple[float, ...]
+
+
+def coverage(records: Sequence[Record]) -> list[tuple[str, str, Coverage]]:
+    """Of every object, in `mm` and `deg`, over the runs that gave a pose of it."""
+    found = []
+    for name in OBJECTS:
+        given = [r for r in records if r["refused"] is None and name in r["errors"] and name in r["quality"]]
+        for kind, key in (("mm", "translation_deviation_mm"), ("deg", "rotation_deviation_deg")):
+            if not given:
+                continue
+            errors = np.abs([record["errors"][name][f"{kind}_xyz"] for record in given])
+            # Errors are told along IS, LR and AP, deviations along the camera's −y, x and z.
+            stated = np.array([record["quality"][name][key] for record in given])[:, [1, 0, 2]]
+            one, two = (tuple((errors <= times * stated).mean(0).tolist()) for times in (1, 2))
+            found.append((name, kind, Coverage(one, two)))
+    return found
+
+
+@dataclass(frozen=True)
 class StageCost:
     """What one step of a plan costs, per run: sums over the views that it is run on."""
 
