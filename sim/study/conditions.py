@@ -28,6 +28,7 @@ from femoreg_torch.settings import read_record
 from femoreg_torch.volume import Volume, read_ct, read_labels, read_mesh
 from sim.patient import Patient, make_scans
 from sim.study.cases import PROCEDURAL_IMAGED_MM, REAL_IMAGED_MM, REGISTERED_MM, Stores, subject_folder
+from sim.study.imperfect_ct import ImperfectCt, spoil_ct
 from sim.study.procedures import Procedure, Study
 from sim.theatre import procedure as theatre
 from sim.theatre.case_folders import check_same_patient, copied, write_images_and_case, write_patient_case
@@ -49,6 +50,7 @@ class Told:
     materials: dict[str, str] = field(default_factory=dict)  # told in place of the true ones
     device_images: bool = True
     sdd: float = 1.0  # distance from source to detector that is told, of the true one
+    ct: ImperfectCt | None = None
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,8 @@ def _ready(condition: Condition, procedure: Procedure, study: Study, out: Imaged
 
 def _origin(condition: Condition, procedure: Procedure, study: Study) -> dict[str, Any]:
     voxels = (REGISTERED_MM, _imaged_mm(procedure))
-    told = {"procedure": asdict(procedure), "voxels_mm": voxels, "told": asdict(condition.told)}
+    said = {key: value for key, value in asdict(condition.told).items() if value is not None}
+    told = {"procedure": asdict(procedure), "voxels_mm": voxels, "told": said}
     return plain(told | {"simulation": _content(condition, study)})
 
 
@@ -245,6 +248,8 @@ def _make_case(condition: Condition, procedure: Procedure, study: Study, body: _
             _without_device_images(folder)
         if condition.told.parts:
             _name_parts(folder, body.device_seed, condition.told.materials)
+        if condition.told.ct is not None:
+            spoil_ct(folder, known.head, condition.told.ct)
         write_json(folder / _ORIGIN, _origin(condition, procedure, study))
 
 

@@ -159,6 +159,17 @@ def test_every_third_pixel_is_the_same_to_rounding(filling):
     close(project([volume], poses, CAMERA.window(rows, columns)), project([volume], poses, CAMERA)[:, rows, columns])
 
 
+@pytest.mark.parametrize("step_mm", [2.0, 1.0, 0.5])
+def test_a_volume_that_moves_in_depth_keeps_its_integral_along_the_middle_ray(step_mm):
+    """Samples go along: at fixed places along the ray the sum would rise and fall with every step of depth."""
+    volume = centred(sparse((20, 21, 40), torch.Generator().manual_seed(3), 0.3))
+    depths = torch.arange(600.0, 603.0, 0.05, dtype=torch.float64)
+    poses = torch.cat([facing(float(z)) for z in depths])
+    middle = project([volume], poses, centred_camera(1000.0, (1.0, 1.0), (1, 1)), step_mm)[:, 0, 0]
+    assert middle.mean() > 1
+    assert float(middle.max() - middle.min()) < 2e-3 * float(middle.mean())
+
+
 def test_a_pose_renders_the_same_alone_and_in_a_batch():
     generator = torch.Generator().manual_seed(7)
     volumes = [centred(smooth((30, 26, 34), generator)), centred(sparse((20, 20, 20), generator), (3, 3, 3))]
