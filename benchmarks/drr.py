@@ -91,7 +91,7 @@ def warm_up(name: str, device: str) -> None:
 def store_scene(volume: Volume, path: Path) -> None:
     """The volume and, for the first pose, a float64 march at 0.1 mm on the coarse pixels."""
     index_from_camera = torch.linalg.inv(poses(volume, 1) @ volume.lps_from_index)
-    exact = march(volume.data.double(), index_from_camera, _COARSE, torch.tensor([0.1]))[0]
+    exact = march(volume.data.double(), index_from_camera, _COARSE, torch.zeros(1), 0.1)[0]
     torch.save({"data": volume.data, "lps_from_index": volume.lps_from_index, "march": exact}, path)
 
 

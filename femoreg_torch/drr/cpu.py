@@ -1,7 +1,7 @@
 """The projector on the CPU: compiled by numba, on all cores, with empty-space skipping for packets of rays.
 
 All kernels walk the rays of one volume in the same way. A ray is `source + t · direction` in padded index space, t mm
-from the X-ray source; samples lie at whole multiples of the step of the pose (`drr.sampling`), whatever else is in the
+from the X-ray source; samples lie whole steps beyond the offset of the pose (`drr.sampling`), whatever else is in the
 batch. The detector is cut into square packets, small enough that all rays of one stay within SPREAD voxels of its
 middle. The middle ray alone finds the runs of samples that may see something; every ray of the packet then takes them.
 """
@@ -55,14 +55,14 @@ def _clip(source, direction, size, margin, enter, leave):  # type: ignore[no-unt
 
 
 @_jit
-def _bounds(shape, margin, step, source, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _bounds(shape, margin, offset, step, source, dx, dy, dz):  # type: ignore[no-untyped-def]
     """First and last sample of a ray at least `margin` voxels inside the padded volume; last < first if none."""
     enter, leave = _clip(source[0], dx, shape[2], margin, 0.0, 1e9)
     enter, leave = _clip(source[1], dy, shape[1], margin, enter, leave)
     enter, leave = _clip(source[2], dz, shape[0], margin, enter, leave)
     if leave < enter:
         return 0, -1
-    return math.ceil(enter / step + 1e-9), math.floor(leave / step - 1e-9)
+    return math.ceil((enter - offset) / step + 1e-9), math.floor((leave - offset) / step - 1e-9)
 
 
 @_jit
@@ -77,14 +77,14 @@ def _inverse(direction):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def _runs(leap, shape, step, source, dx, dy, dz, starts, ends):  # type: ignore[no-untyped-def]
+def _runs(leap, shape, offset, step, source, dx, dy, dz, starts, ends):  # type: ignore[no-untyped-def]
     """Runs of samples [start, end) of a packet's middle ray that may see something; returns how many."""
-    k, last = _bounds(shape, float(SPREAD), step, source, dx, dy, dz)
+    k, last = _bounds(shape, float(SPREAD), offset, step, source, dx, dy, dz)
     x, y, z, size, per_step = source[0], source[1], source[2], float(BRICK), 1.0 / step
     ix, iy, iz = _inverse(dx), _inverse(dy), _inverse(dz)
     n = 0
     while k <= last:
-        t = k * step
+        t = offset + k * step
         bx, by, bz = int(x + t * dx) >> _SHIFT, int(y + t * dy) >> _SHIFT, int(z + t * dz) >> _SHIFT
         distance = leap[bz, by, bx]
         reach = distance - 1 if distance > 0 else 0
@@ -93,7 +93,7 @@ def _runs(leap, shape, step, source, dx, dy, dz, starts, ends):  # type: ignore[
             _exit(y, iy, (by - reach) * size, (by + 1 + reach) * size),
             _exit(z, iz, (bz - reach) * size, (bz + 1 + reach) * size),
         )
-        beyond = min(max(k + 1, int(out * per_step) + 1), last + 1)
+        beyond = min(max(k + 1, int((out - offset) * per_step) + 1), last + 1)
         if distance == 0:
             if n > 0 and (ends[n - 1] == k or n == _MOST_RUNS):
                 ends[n - 1] = beyond
@@ -114,19 +114,19 @@ def _lowest(source, direction, t0, t1):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def _start(source, first, end, step, dx, dy, dz, height, width):  # type: ignore[no-untyped-def]
+def _start(source, first, end, offset, step, dx, dy, dz, height, width):  # type: ignore[no-untyped-def]
     """A run's lowest corner (as a flat index), the offset of its first sample from it, and the offset per sample."""
-    i, x = _lowest(source[0], dx, first * step, (end - 1) * step)
-    j, y = _lowest(source[1], dy, first * step, (end - 1) * step)
-    k, z = _lowest(source[2], dz, first * step, (end - 1) * step)
+    i, x = _lowest(source[0], dx, offset + first * step, offset + (end - 1) * step)
+    j, y = _lowest(source[1], dy, offset + first * step, offset + (end - 1) * step)
+    k, z = _lowest(source[2], dz, offset + first * step, offset + (end - 1) * step)
     base = (k * height + j) * width + i
     return base, x, y, z, np.float32(dx * step), np.float32(dy * step), np.float32(dz * step)
 
 
 @_jit
-def _integral(flat, height, width, first, end, step, source, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _integral(flat, height, width, first, end, offset, step, source, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Sum of the trilinear values of samples first … end − 1. Offsets are float32, from the run's lowest voxel."""
-    base, x0, y0, z0, ax, ay, az = _start(source, first, end, step, dx, dy, dz, height, width)
+    base, x0, y0, z0, ax, ay, az = _start(source, first, end, offset, step, dx, dy, dz, height, width)
     row, slab = np.int32(width), np.int32(height * width)
     total = np.float32(0.0)
     for n in range(end - first):
@@ -148,9 +148,9 @@ def _integral(flat, height, width, first, end, step, source, dx, dy, dz):  # typ
 
 
 @_jit
-def _moments(flat, height, width, first, end, step, source, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _moments(flat, height, width, first, end, offset, step, source, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Σ slope (3) and Σ t · slope (3) over a run: all that a derivative by the affine needs; then Σ value."""
-    base, x0, y0, z0, ax, ay, az = _start(source, first, end, step, dx, dy, dz, height, width)
+    base, x0, y0, z0, ax, ay, az = _start(source, first, end, offset, step, dx, dy, dz, height, width)
     row, slab = np.int32(width), np.int32(height * width)
     sx = sy = sz = np.float32(0.0)  # Σ slope
     nx = ny = nz = np.float32(0.0)  # Σ n · slope, n counted from the run's first sample
@@ -180,7 +180,7 @@ def _moments(flat, height, width, first, end, step, source, dx, dy, dz):  # type
         ny += s * gy
         nz += s * gz
         total += low + w * (high - low)
-    t = first * step
+    t = offset + first * step
     return sx, sy, sz, t * sx + step * nx, t * sy + step * ny, t * sz + step * nz, total
 
 
@@ -195,14 +195,14 @@ def _first_packet(principal, edge):  # type: ignore[no-untyped-def]
 
 # Kernels: poses × packets, shared out among the cores ----------------------------------------------------------------
 @_parallel
-def _forward(padded, leap, affines, detector, steps, edges, workers, out):  # type: ignore[no-untyped-def]
+def _forward(padded, leap, affines, detector, offsets, step, edges, workers, out):  # type: ignore[no-untyped-def]
     poses, rows, columns = out.shape
     flat = padded.reshape(-1)
     height, width = padded.shape[1], padded.shape[2]
     for worker in nb.prange(workers):
         starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
         for pose in range(poses):
-            affine, step, edge = affines[pose], steps[pose], edges[pose]
+            affine, offset, edge = affines[pose], offsets[pose], edges[pose]
             source = affine[:, 3]
             first_top, first_left = _first_packet(detector[4], edge), _first_packet(detector[3], edge)
             bands = -(-(rows - first_top) // edge)
@@ -211,7 +211,7 @@ def _forward(padded, leap, affines, detector, steps, edges, workers, out):  # ty
                 for left in range(first_left, columns, edge):
                     middle_row, middle_column = top + (edge - 1) / 2, left + (edge - 1) / 2
                     _, _, _, dx, dy, dz = _ray(affine, detector, middle_row, middle_column)
-                    n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
+                    n = _runs(leap, padded.shape, offset, step, source, dx, dy, dz, starts, ends)
                     if n > 0:
                         for row in range(max(top, 0), min(top + edge, rows)):
                             for column in range(max(left, 0), min(left + edge, columns)):
@@ -219,20 +219,20 @@ def _forward(padded, leap, affines, detector, steps, edges, workers, out):  # ty
                                 total = np.float32(0.0)
                                 for i in range(n):
                                     total += _integral(
-                                        flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
+                                        flat, height, width, starts[i], ends[i], offset, step, source, dx, dy, dz
                                     )
                                 out[pose, row, column] = np.float32(step) * total
 
 
 @_parallel
-def _with_moments(padded, leap, affines, detector, steps, edges, workers, image, moments):  # type: ignore[no-untyped-def]
+def _with_moments(padded, leap, affines, detector, offsets, step, edges, workers, image, moments):  # type: ignore[no-untyped-def]
     poses, rows, columns = image.shape
     flat = padded.reshape(-1)
     height, width = padded.shape[1], padded.shape[2]
     for worker in nb.prange(workers):
         starts, ends = np.empty(_MOST_RUNS, np.int64), np.empty(_MOST_RUNS, np.int64)
         for pose in range(poses):
-            affine, step, edge = affines[pose], steps[pose], edges[pose]
+            affine, offset, edge = affines[pose], offsets[pose], edges[pose]
             source = affine[:, 3]
             first_top, first_left = _first_packet(detector[4], edge), _first_packet(detector[3], edge)
             bands = -(-(rows - first_top) // edge)
@@ -241,7 +241,7 @@ def _with_moments(padded, leap, affines, detector, steps, edges, workers, image,
                 for left in range(first_left, columns, edge):
                     middle_row, middle_column = top + (edge - 1) / 2, left + (edge - 1) / 2
                     _, _, _, dx, dy, dz = _ray(affine, detector, middle_row, middle_column)
-                    n = _runs(leap, padded.shape, step, source, dx, dy, dz, starts, ends)
+                    n = _runs(leap, padded.shape, offset, step, source, dx, dy, dz, starts, ends)
                     if n > 0:
                         for row in range(max(top, 0), min(top + edge, rows)):
                             for column in range(max(left, 0), min(left + edge, columns)):
@@ -249,7 +249,7 @@ def _with_moments(padded, leap, affines, detector, steps, edges, workers, image,
                                 sx = sy = sz = tx = ty = tz = total = 0.0
                                 for i in range(n):
                                     ax, ay, az, bx, by, bz, value = _moments(
-                                        flat, height, width, starts[i], ends[i], step, source, dx, dy, dz
+                                        flat, height, width, starts[i], ends[i], offset, step, source, dx, dy, dz
                                     )
                                     sx += ax
                                     sy += ay
@@ -265,22 +265,22 @@ def _with_moments(padded, leap, affines, detector, steps, edges, workers, image,
 
 
 @_parallel
-def _scatter(affines, detector, steps, workers, upstream, parts):  # type: ignore[no-untyped-def]
+def _scatter(affines, detector, offsets, step, workers, upstream, parts):  # type: ignore[no-untyped-def]
     poses, rows, columns = upstream.shape
     shape = parts.shape[1:]
     for worker in nb.prange(workers):
         mine = parts[worker]
         for line in range(worker, poses * rows, workers):
             pose, row = line // rows, line % rows
-            affine, step = affines[pose], steps[pose]
+            affine, offset = affines[pose], offsets[pose]
             source = affine[:, 3]
             for column in range(columns):
                 share = step * upstream[pose, row, column]
                 if share != 0.0:
                     _, _, _, dx, dy, dz = _ray(affine, detector, row, column)
-                    first, last = _bounds(shape, 0.0, step, source, dx, dy, dz)
+                    first, last = _bounds(shape, 0.0, offset, step, source, dx, dy, dz)
                     for k in range(first, last + 1):
-                        t = k * step
+                        t = offset + k * step
                         x, y, z = source[0] + t * dx, source[1] + t * dy, source[2] + t * dz
                         i, j, n = int(x), int(y), int(z)
                         u, v, w = x - i, y - j, z - n
@@ -315,33 +315,39 @@ def _packet_edges(volume: BrickedVolume, affines: Array, camera: Camera) -> NDAr
     return np.clip(1 + (SPREAD * math.sqrt(2) / per_pixel).astype(np.int64), 1, _MOST_RAYS)
 
 
-def projection(volume: BrickedVolume, affines: Array, camera: Camera, steps: Array) -> NDArray[np.float32]:
-    """Line integrals (B, H, W) of one volume for `affines` (B, 3, 4), index from camera mm, and steps (B,) mm."""
+def projection(
+    volume: BrickedVolume, affines: Array, camera: Camera, offsets: Array, step_mm: float
+) -> NDArray[np.float32]:
+    """Line integrals (B, H, W) of one volume for `affines` (B, 3, 4), index from camera mm, and offsets (B,) mm."""
     edges = _packet_edges(volume, affines, camera)
     image = np.zeros((len(affines), *camera.shape), np.float32)
     padded = _padded_affines(affines)
-    _forward(volume.padded, volume.leap, padded, _detector(camera), steps, edges, nb.get_num_threads(), image)
+    _forward(
+        volume.padded, volume.leap, padded, _detector(camera), offsets, step_mm, edges, nb.get_num_threads(), image
+    )
     return image
 
 
 def projection_with_moments(
-    volume: BrickedVolume, affines: Array, camera: Camera, steps: Array
+    volume: BrickedVolume, affines: Array, camera: Camera, offsets: Array, step_mm: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Line integrals (B, H, W), and the moments (B, H, W, 6) that hold their derivatives (`drr.moments`)."""
     edges = _packet_edges(volume, affines, camera)
     image = np.zeros((len(affines), *camera.shape), np.float32)
     moments = np.zeros((*image.shape, 6), np.float32)
     padded, workers = _padded_affines(affines), nb.get_num_threads()
-    _with_moments(volume.padded, volume.leap, padded, _detector(camera), steps, edges, workers, image, moments)
+    _with_moments(
+        volume.padded, volume.leap, padded, _detector(camera), offsets, step_mm, edges, workers, image, moments
+    )
     return image, moments
 
 
 def volume_gradient(
-    volume: BrickedVolume, affines: Array, camera: Camera, steps: Array, upstream: NDArray[np.float32]
+    volume: BrickedVolume, affines: Array, camera: Camera, offsets: Array, step_mm: float, upstream: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Gradient (Z, Y, X) of Σ upstream · image with respect to the volume's data; `upstream` is (B, H, W)."""
     workers = nb.get_num_threads()
     parts = np.zeros((workers, *volume.padded.shape), np.float32)
-    _scatter(_padded_affines(affines), _detector(camera), steps, workers, upstream, parts)
+    _scatter(_padded_affines(affines), _detector(camera), offsets, step_mm, workers, upstream, parts)
     inside = tuple(slice(RIM, RIM + n) for n in volume.shape)
     return np.ascontiguousarray(parts.sum(0)[inside])

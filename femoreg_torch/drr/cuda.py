@@ -16,7 +16,6 @@ from torch.autograd.function import once_differentiable
 
 from femoreg_torch.drr.bricks import RIM
 from femoreg_torch.drr.device_bricks import bricked_on_device, padded_shape
-from femoreg_torch.drr.moments import step_gradient
 from femoreg_torch.geometry.camera import Camera
 from femoreg_torch.volume.grid import Volume
 
@@ -55,31 +54,33 @@ def _too_large(volume: Volume) -> str | None:
     return f"the volume has {voxels} voxels with its rim, the kernels can count 2³¹" if voxels >= _MOST_VOXELS else None
 
 
-def project(volume: Volume, affines: Tensor, camera: Camera, steps: Tensor, tile: int = TILE) -> Tensor:
-    """Line integrals (B, H, W) float32 of a volume for `affines` (B, 3, 4), index from camera mm, and `steps` (B,) mm.
+def project(
+    volume: Volume, affines: Tensor, camera: Camera, offsets: Tensor, step_mm: float, tile: int = TILE
+) -> Tensor:
+    """Line integrals (B, H, W) float32 of a volume for `affines` (B, 3, 4), index from camera mm.
 
-    Both are float64. Differentiable in both, and in the volume's data, which may be float16 or bfloat16: sums are
-    float32 all the same. The gradient by `affines` is the same in every run, that by the data to rounding only (it
-    needs atomics). A pose that is not finite gives an image of nan: to raise an error would mean to wait for the
-    device. `tile` is a power of two: the rays along the edge of a tile, which leap together.
+    Samples lie whole steps beyond `offsets` (B,) mm. Differentiable in both (float64), and in the volume's data, which
+    may be float16 or bfloat16: sums are float32 all the same. The gradient by `affines` is the same in every run, that
+    by the data to rounding only (it needs atomics). A pose that is not finite gives an image of nan: to raise an error
+    would mean to wait for the device. `tile` is a power of two: the rays along the edge of a tile, which leap together.
     """
-    image: Tensor = _Projection.apply(volume.data, affines, steps, volume, camera, tile)
+    image: Tensor = _Projection.apply(volume.data, affines, offsets, volume, camera, step_mm, tile)
     return image
 
 
 def jacobian(
-    volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, steps: Tensor, tile: int = TILE
+    volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, offsets: Tensor, step_mm: float, tile: int = TILE
 ) -> tuple[Tensor, Tensor]:
     """Line integrals (B, H, W) and their derivatives (B, H, W, n).
 
     `changes` (B, n, 3, 4) are the derivatives of `affines` (B, 3, 4) with respect to the n parameters, all float64.
-    Samples stay at whole multiples of `steps` (B,) mm.
+    Samples stay whole steps beyond `offsets` (B,) mm.
     `tile` is as for `project`.
     """
     image = volume.data.new_empty((len(affines), *camera.shape), dtype=torch.float32)
     derivatives = image.new_empty((*image.shape, changes.shape[1]))
     outputs = (changes.contiguous(), changes.shape[1], image, derivatives)
-    _launch(_kernels().jacobian, _contents(volume), volume, affines, camera, steps, tile, outputs)
+    _launch(_kernels().jacobian, _contents(volume), volume, affines, camera, offsets, step_mm, tile, outputs)
     return image, derivatives
 
 
@@ -88,32 +89,39 @@ class _Projection(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, data: Tensor, affines: Tensor, steps: Tensor, volume: Volume, camera: Camera, tile: int
+        ctx: Any,
+        data: Tensor,
+        affines: Tensor,
+        offsets: Tensor,
+        volume: Volume,
+        camera: Camera,
+        step_mm: float,
+        tile: int,
     ) -> Tensor:
-        ctx.volume, ctx.camera, ctx.tile = volume, camera, tile
+        ctx.volume, ctx.camera, ctx.step_mm, ctx.tile = volume, camera, step_mm, tile
         image = data.new_empty((len(affines), *camera.shape), dtype=torch.float32)
-        _launch(_kernels().forward, _contents(volume), volume, affines, camera, steps, tile, (image,))
-        ctx.save_for_backward(affines, steps, image)
+        _launch(_kernels().forward, _contents(volume), volume, affines, camera, offsets, step_mm, tile, (image,))
+        ctx.save_for_backward(affines, offsets)
         return image
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        affines, steps, image = ctx.saved_tensors
-        scene = (ctx.volume, affines, ctx.camera, steps, ctx.tile)
+        affines, offsets = ctx.saved_tensors
+        scene = (ctx.volume, affines, ctx.camera, offsets, ctx.step_mm, ctx.tile)
         weights = upstream.to(torch.float32).contiguous()
-        data_gradient = affine_gradient = by_steps = None
+        data_gradient = affine_gradient = by_offsets = None
         if ctx.needs_input_grad[0]:
             shape = ctx.volume.data.shape
             padded = weights.new_zeros(padded_shape(shape))
             _launch(_kernels().volume_gradient, (), *scene, (weights, padded))
             data_gradient = padded[tuple(slice(RIM, RIM + n) for n in shape)]
         if ctx.needs_input_grad[1] or ctx.needs_input_grad[2]:
-            parts = affines.new_empty((len(affines), _tiles(ctx.camera, ctx.tile), 3, 4))
+            parts = affines.new_empty((len(affines), _tiles(ctx.camera, ctx.tile), 13))
             _launch(_kernels().pose_gradient, _contents(ctx.volume), *scene, (weights, parts))
-            affine_gradient = parts.sum(1)
-            by_steps = step_gradient(image, affines, steps, weights, affine_gradient)
-        return data_gradient, affine_gradient, by_steps, None, None, None
+            sums = parts.sum(1)
+            affine_gradient, by_offsets = sums[:, :12].unflatten(1, (3, 4)), sums[:, 12]
+        return data_gradient, affine_gradient, by_offsets, None, None, None, None
 
 
 @functools.cache
@@ -137,12 +145,13 @@ def _launch(
     volume: Volume,
     affines: Tensor,
     camera: Camera,
-    steps: Tensor,
+    offsets: Tensor,
+    step_mm: float,
     tile: int,
     outputs: tuple[Tensor | int, ...],
 ) -> None:
     """Run a kernel, one program per tile and pose; all take these arguments in this order."""
-    geometry = torch.tensor([camera.sdd_mm, *camera.pixel_mm, *camera.principal_point_px], dtype=torch.float64)
+    geometry = torch.tensor([camera.sdd_mm, *camera.pixel_mm, *camera.principal_point_px, step_mm], dtype=torch.float64)
     padded_affines = affines.detach().to(torch.float64, memory_format=torch.contiguous_format, copy=True)
     padded_affines[:, :, 3] += RIM
     with torch.cuda.device_of(volume.data):  # Triton launches on the current device
@@ -150,7 +159,7 @@ def _launch(
             *contents,
             padded_affines,
             geometry.to(affines.device, non_blocking=True),
-            steps.detach().to(torch.float64).contiguous(),
+            offsets.detach().to(torch.float64).contiguous(),
             *padded_shape(volume.data.shape),
             *camera.shape,
             *outputs,

@@ -2,8 +2,8 @@
 
 A sample lies at x = A u t + b in index space, with the unit ray u, the distance t from the source, the affine (A | b).
 For an image I = step · Σ_k V(x_k) the chain rule gives ∂I/∂b = step · Σ ∇V and ∂I/∂A = step · Σ t ∇V uᵀ. So the moments
-(step · Σ ∇V, step · Σ t ∇V), six numbers per pixel, hold every derivative with respect to any pose parameter. The step
-itself goes along with the volume (`drr.sampling`): with t = k · step, ∂I/∂log step = I + step · Σ t ∇V · A u.
+(step · Σ ∇V, step · Σ t ∇V), six numbers per pixel, hold every derivative with respect to any pose parameter. Where
+the samples go along the rays (`drr.sampling`), I changes by step · Σ ∇V · A u per mm.
 """
 
 import torch
@@ -29,10 +29,10 @@ def affine_gradient(moments: Tensor, camera: Camera, upstream: Tensor) -> Tensor
     return torch.stack(gradients)
 
 
-def step_gradient(image: Tensor, affines: Tensor, steps: Tensor, upstream: Tensor, by_affines: Tensor) -> Tensor:
-    """Gradient (B,) of Σ upstream · image by the steps (B,), from that by the affines (B, 3, 4)."""
-    stretched = (affines[:, :, :3] * by_affines[:, :, :3]).sum((1, 2))  # Σ upstream · step · Σ t ∇V · A u
-    return ((upstream * image).sum((1, 2), dtype=torch.float64) + stretched) / steps
+def offset_gradient(moments: Tensor, affines: Tensor, camera: Camera, upstream: Tensor) -> Tensor:
+    """Gradient (B,) float64 of Σ upstream · image by the offsets; affines (B, 3, 4), upstream (B, H, W)."""
+    directions = torch.einsum("hwj,bij->bhwi", unit_rays(camera), affines[:, :, :3].to(torch.float32))
+    return ((moments[..., :3] * directions).sum(-1) * upstream).sum((1, 2), dtype=torch.float64)
 
 
 def jacobian(moments: Tensor, camera: Camera, changes: Tensor) -> Tensor:

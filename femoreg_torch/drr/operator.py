@@ -11,9 +11,9 @@ from torch.autograd.function import once_differentiable
 
 from femoreg_torch.drr import cpu, cuda
 from femoreg_torch.drr.bricks import bricked
-from femoreg_torch.drr.moments import affine_gradient, jacobian, step_gradient, unit_rays
+from femoreg_torch.drr.moments import affine_gradient, jacobian, offset_gradient, unit_rays
 from femoreg_torch.drr.reference import march
-from femoreg_torch.drr.sampling import middle_of, step_rates, steps_of
+from femoreg_torch.drr.sampling import middle_of, offset_rates, offsets_of
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry.camera import Camera
 from femoreg_torch.geometry.rigid import skew
@@ -32,9 +32,9 @@ def project(
 
     `camera_from_volume` maps the mm space of the volume (LPS or CAD) into the camera frame: (B, 4, 4) of one volume, or
     (B, V, 4, 4) of a sequence of V volumes.
-    Values are interpolated trilinearly, are zero outside, and are summed along each ray at whole multiples of a step
-    from the source, times the step: `step_mm`, made a little shorter or longer so that a sample lies on the middle of
-    the volume (`drr.sampling`). Returns (B, H, W) float32, summed over volumes, or (B, V, H, W) if `separate`.
+    Values are interpolated trilinearly, are zero outside, and are summed along each ray every `step_mm`, times the
+    step; samples are counted from the middle of each volume (`drr.sampling`). Returns (B, H, W) float32, summed over
+    volumes, or (B, V, H, W) if `separate`.
 
     Differentiable in `camera_from_volume` and in the volumes' data. Compiled kernels that skip empty space do the work,
     on the device of the volumes: numba's on the CPU, Triton's on CUDA, where poses should be as well, as a copy from
@@ -80,35 +80,36 @@ def project_with_jacobian(
         middle = middle_of(volume, camera_from_volume)
         generators = _twist_generators(centre.to(index_from_camera))
         velocities = (generators[:, :3, :3] @ middle[:, None, :, None])[..., 0] + generators[:, :3, 3]  # (B, 6, 3)
-        rates = step_rates(middle, velocities, step_mm).to(torch.float32)[:, None, None]
+        rates = offset_rates(middle, velocities).to(torch.float32)[:, None, None]
         # To move the object is to move the camera's points in it the other way.
-        changes = torch.cat(
-            [-affines[:, None] @ generators, affines[:, None] @ _ray_generators(camera).to(index_from_camera)], 1
-        )
-    steps = steps_of(middle, step_mm)
-    image, derivatives = _with_derivatives(volume, affines, changes, camera, steps)
-    moved, turned, stretched = derivatives.split([6, 3, 1], -1)
-    moved = moved + rates * (image[..., None] + stretched)  # as the step goes along
+        changes = -affines[:, None] @ generators
+        if intrinsics:
+            changes = torch.cat([changes, affines[:, None] @ _ray_generators(camera).to(index_from_camera)], 1)
+    image, derivatives = _with_derivatives(volume, affines, changes, camera, offsets_of(middle, step_mm), step_mm)
+    rays = unit_rays(camera).to(image.device)
+    along = -(derivatives[..., 3:6] * rays).sum(-1, keepdim=True)  # of samples that go along each ray
+    moved = derivatives[..., :6] + rates * along
     if not intrinsics:
         return image, moved
-    rays = unit_rays(camera).to(image.device)
+    turned, stretched = derivatives[..., 6:9], derivatives[..., 9:]
     shares = torch.einsum("hwi,nij,hwj->hwn", rays, _ray_generators(camera)[:3, :3, :3].to(rays), rays)
     return image, torch.cat([moved, turned - shares * stretched], -1)
 
 
 def _with_derivatives(
-    volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, steps: Tensor
+    volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, offsets: Tensor, step_mm: float
 ) -> tuple[Tensor, Tensor]:
     """Images (B, H, W) and their derivatives (B, H, W, n) by parameters that change the affines by (B, n, 3, 4).
 
-    Samples lie at whole multiples of `steps` (B,) mm.
+    Samples stay whole steps beyond `offsets` (B,) mm.
     """
     if volume.data.device.type == "cpu":
-        image, moments = cpu.projection_with_moments(bricked(volume), affines.numpy(), camera, steps.numpy())
+        numbers = affines.numpy(), camera, offsets.numpy(), step_mm
+        image, moments = cpu.projection_with_moments(bricked(volume), *numbers)
         return torch.from_numpy(image), jacobian(torch.from_numpy(moments), camera, changes)
     if reason := cuda.why_not(volume):
         raise InputError(f"project_with_jacobian: {reason}. Move the volume to the CPU, or use Triton on CUDA.")
-    return cuda.jacobian(volume, affines, changes, camera, steps)
+    return cuda.jacobian(volume, affines, changes, camera, offsets, step_mm)
 
 
 def _twist_generators(centre: Tensor) -> Tensor:
@@ -158,14 +159,14 @@ def _index_from_camera(volume: Volume, camera_from_volume: Tensor) -> Tensor:
 
 def _project_one(volume: Volume, camera_from_volume: Tensor, camera: Camera, step_mm: float) -> Tensor:
     index_from_camera = _index_from_camera(volume, camera_from_volume)
-    affines, steps = index_from_camera[:, :3], steps_of(middle_of(volume, camera_from_volume), step_mm)
+    affines, offsets = index_from_camera[:, :3], offsets_of(middle_of(volume, camera_from_volume), step_mm)
     if volume.data.device.type == "cpu":
-        image: Tensor = _CpuProjection.apply(volume.data, affines, steps, volume, camera)
+        image: Tensor = _CpuProjection.apply(volume.data, affines, offsets, volume, camera, step_mm)
         return image
     if reason := cuda.why_not(volume):
         _warn_of_the_march(reason)
-        return march(volume.data, index_from_camera.to(torch.float32), camera, steps)
-    return cuda.project(volume, affines, camera, steps)
+        return march(volume.data, index_from_camera.to(torch.float32), camera, offsets, step_mm)
+    return cuda.project(volume, affines, camera, offsets, step_mm)
 
 
 @functools.cache
@@ -175,29 +176,31 @@ def _warn_of_the_march(reason: str) -> None:
 
 
 class _CpuProjection(torch.autograd.Function):
-    """The CPU kernels as an autograd function of volume data, index-from-camera affines (B, 3, 4), steps (B,)."""
+    """The CPU kernels as an autograd function of volume data, index-from-camera affines (B, 3, 4), offsets (B,)."""
 
     @staticmethod
-    def forward(ctx: Any, data: Tensor, affines: Tensor, steps: Tensor, volume: Volume, camera: Camera) -> Tensor:
-        ctx.volume, ctx.camera = volume, camera
-        numbers, moments = (affines.detach().numpy(), camera, steps.detach().numpy()), None
+    def forward(
+        ctx: Any, data: Tensor, affines: Tensor, offsets: Tensor, volume: Volume, camera: Camera, step_mm: float
+    ) -> Tensor:
+        ctx.volume, ctx.camera, ctx.step_mm = volume, camera, step_mm
+        numbers, moments = (affines.detach().numpy(), camera, offsets.detach().numpy(), step_mm), None
         if ctx.needs_input_grad[1]:  # one walk along the rays gives image and derivatives
-            image, moments = map(torch.from_numpy, cpu.projection_with_moments(bricked(volume), *numbers))
+            image, moments = cpu.projection_with_moments(bricked(volume), *numbers)
         else:
-            image = torch.from_numpy(cpu.projection(bricked(volume), *numbers))
-        ctx.save_for_backward(affines, steps, image, moments)
-        return image
+            image = cpu.projection(bricked(volume), *numbers)
+        ctx.save_for_backward(affines, offsets, None if moments is None else torch.from_numpy(moments))
+        return torch.from_numpy(image)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        affines, steps, image, moments = ctx.saved_tensors
+        affines, offsets, moments = ctx.saved_tensors
         weights = upstream.to(torch.float32)
-        by_data = by_affines = by_steps = None
+        by_data = by_affines = by_offsets = None
         if ctx.needs_input_grad[0]:
-            numbers = affines.detach().numpy(), ctx.camera, steps.detach().numpy(), weights.contiguous().numpy()
-            by_data = torch.from_numpy(cpu.volume_gradient(bricked(ctx.volume), *numbers))
+            numbers = affines.detach().numpy(), ctx.camera, offsets.detach().numpy(), ctx.step_mm
+            by_data = torch.from_numpy(cpu.volume_gradient(bricked(ctx.volume), *numbers, weights.contiguous().numpy()))
         if moments is not None:
             by_affines = affine_gradient(moments, ctx.camera, weights)
-            by_steps = step_gradient(image, affines, steps, weights, by_affines)
-        return by_data, by_affines, by_steps, None, None
+            by_offsets = offset_gradient(moments, affines, ctx.camera, weights)
+        return by_data, by_affines, by_offsets, None, None, None

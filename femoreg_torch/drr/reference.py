@@ -26,11 +26,11 @@ def trilinear(data: Tensor, points: Tensor) -> Tensor:
     return total
 
 
-def march(data: Tensor, index_from_camera: Tensor, camera: Camera, steps: Tensor) -> Tensor:
-    """Line integrals (B, H, W) through `data` (Z, Y, X), Σ value · step at the 1st, 2nd, … step from the source.
+def march(data: Tensor, index_from_camera: Tensor, camera: Camera, offsets: Tensor, step_mm: float) -> Tensor:
+    """Line integrals (B, H, W) through `data` (Z, Y, X), Σ value · step at whole steps beyond an offset.
 
-    `index_from_camera` is (B, 4, 4) and maps mm in the camera frame to (x, y, z) indices; `steps` (B,) are in mm along
-    each ray.
+    `index_from_camera` is (B, 4, 4) and maps mm in the camera frame to (x, y, z) indices; `offsets` (B,) are in mm from
+    the source along each ray.
     """
     dtype, device = index_from_camera.dtype, index_from_camera.device
     ray = camera.pixel_positions(dtype).to(device)
@@ -38,17 +38,17 @@ def march(data: Tensor, index_from_camera: Tensor, camera: Camera, steps: Tensor
     data = data.to(dtype)
     last = torch.tensor(data.shape[::-1], dtype=dtype, device=device)
     images = []
-    for affine, step in zip(index_from_camera, steps.to(index_from_camera), strict=True):
+    for affine, offset in zip(index_from_camera, offsets.to(index_from_camera), strict=True):
         direction, source = ray @ affine[:3, :3].mT, affine[:3, 3]
         with torch.no_grad():  # which samples can meet the volume at all
             to_faces = torch.stack([-1 - source, last - source]) / direction[..., None, :]  # (H, W, 2, 3)
             enter = to_faces.nan_to_num(-torch.inf).amin(-2).amax(-1)
             leave = to_faces.nan_to_num(torch.inf).amax(-2).amin(-1)
             hit = (leave > enter) & (leave > 0)
-            first = max(1, int((enter[hit] / step).floor().min())) if hit.any() else 1
-            final = int((leave[hit] / step).ceil().max()) if hit.any() else -1
+            first = max(0, int(((enter[hit] - offset) / step_mm).floor().min())) if hit.any() else 0
+            final = int(((leave[hit] - offset) / step_mm).ceil().max()) if hit.any() else -1
         total = torch.zeros(camera.shape, dtype=dtype, device=device)
         for k in range(first, final + 1):
-            total = total + trilinear(data, source + (k * step) * direction)
-        images.append(total * step)
+            total = total + trilinear(data, source + (offset + k * step_mm) * direction)
+        images.append(total * step_mm)
     return torch.stack(images)

@@ -2,14 +2,14 @@
 """The projector's kernels in Triton. Importing this module imports Triton; only `cuda.py` does, and only when needed.
 
 One program renders a square tile of rays of one pose. As on the CPU, a ray is `source + t · direction` in padded index
-space, and its samples lie at whole multiples of the step of the pose. What decides where a sample lies is computed in
+space, and its samples lie whole steps beyond the offset of the pose. What decides where a sample lies is computed in
 float64, once per ray; from there on the ray counts in float32 voxels from the voxel it enters by, so that indices of a
 thousand cost no accuracy. All rays of a tile are at the same sample number, and leap together, as far as the one that
 may leap least.
 
-Tensors, all contiguous: `affines` (B, 3, 4) float64, padded index from camera mm; `geometry` (5,) float64, see
-`_unit_rays`; `steps` (B,) float64, mm; `volume` (depth, height, width) in any float type; `leap` uint8, one per brick,
-see `bricks.py`.
+Tensors, all contiguous: `affines` (B, 3, 4) float64, padded index from camera mm; `geometry` (6,) float64, see
+`_unit_rays`; `offsets` (B,) float64, mm; `volume` (depth, height, width) in any float type; `leap` uint8, one per
+brick, see `bricks.py`.
 """
 
 import triton
@@ -47,7 +47,7 @@ def _pixels(rows, columns, tile: tl.constexpr):
 
 @triton.jit
 def _unit_rays(geometry, row, column):
-    """Unit rays in the camera frame. `geometry`: source to detector, row and column spacing, principal point."""
+    """Unit rays in the camera frame. `geometry`: source to detector, row and column spacing, principal point, step."""
     z = tl.load(geometry)
     y = (row - tl.load(geometry + 4)) * tl.load(geometry + 1)
     x = (column - tl.load(geometry + 3)) * tl.load(geometry + 2)
@@ -65,15 +65,18 @@ def _clip(enter, leave, source, direction, size):
 
 
 @triton.jit
-def _axis(source, direction, first, step):
-    """Where a ray's first sample lies along one axis: voxel and float32 rest; then float32 voxels per sample."""
-    start = source + first * step * direction
+def _axis(source, direction, nearest, step):
+    """Where a ray's first sample, `nearest` mm from the source, lies along one axis.
+
+    Voxel and float32 rest; then float32 voxels per sample.
+    """
+    start = source + nearest * direction
     voxel = tl.floor(start)
     return voxel.to(tl.int32), (start - voxel).to(tl.float32), (step * direction).to(tl.float32)
 
 
 @triton.jit
-def _rays(affines, pose, step, x, y, z, on, depth, height, width):
+def _rays(affines, pose, offset, step, x, y, z, on, depth, height, width):
     """First sample and number of samples of each ray, three axes as in `_axis`, and 0, or nan if the pose is not sane.
 
     A pose cannot be looked at from the host without waiting for the device. One with nan, inf or absurd numbers renders
@@ -92,13 +95,14 @@ def _rays(affines, pose, step, x, y, z, on, depth, height, width):
     enter, leave = _clip(enter, leave, source_y, dy, height)
     enter, leave = _clip(enter, leave, source_z, dz, depth)
     hit = on & sane & (enter <= leave)
-    first = tl.where(hit, tl.ceil(tl.minimum(enter / step + 1e-9, FAR)), 0).to(tl.int32)
-    last = tl.where(hit, tl.floor(tl.minimum(leave / step - 1e-9, FAR)), -1).to(tl.int32)
+    first = tl.where(hit, tl.ceil(tl.minimum((enter - offset) / step + 1e-9, FAR)), 0).to(tl.int32)
+    last = tl.where(hit, tl.floor(tl.minimum((leave - offset) / step - 1e-9, FAR)), -1).to(tl.int32)
     count = tl.maximum(last - first + 1, 0)
 
-    along_x = _axis(source_x, dx, first, step)
-    along_y = _axis(source_y, dy, first, step)
-    along_z = _axis(source_z, dz, first, step)
+    nearest = offset + first * step
+    along_x = _axis(source_x, dx, nearest, step)
+    along_y = _axis(source_y, dy, nearest, step)
+    along_z = _axis(source_z, dz, nearest, step)
     return first, count, along_x, along_y, along_z, tl.where(sane, 0.0, float("nan"))
 
 
@@ -194,15 +198,15 @@ def _march(volume, leap, first, count, along_x, along_y, along_z, height, width)
 
 
 @triton.jit
-def _moments(volume, leap, affines, steps, x, y, z, on, depth, height, width):
+def _moments(volume, leap, affines, geometry, offsets, x, y, z, on, depth, height, width):
     """Per ray, times the step: Σ value, then in float64 Σ slope (3) and Σ t · slope (3), t mm from the source."""
-    step = tl.load(steps + tl.program_id(1))
+    step, offset = tl.load(geometry + 5), tl.load(offsets + tl.program_id(1))
     first, count, along_x, along_y, along_z, fault = _rays(
-        affines, tl.program_id(1), step, x, y, z, on, depth, height, width
+        affines, tl.program_id(1), offset, step, x, y, z, on, depth, height, width
     )
     total, sx, sy, sz, nx, ny, nz = _march(volume, leap, first, count, along_x, along_y, along_z, height, width)
     image = step * total + fault
-    t = first * step
+    t = offset + first * step
     sx, sy, sz = step * sx + fault, step * sy + fault, step * sz + fault
     return image, sx, sy, sz, t * sx + step * step * nx, t * sy + step * step * ny, t * sz + step * step * nz
 
@@ -213,30 +217,35 @@ _kernel = triton.jit(do_not_specialize=["depth", "height", "width", "rows", "col
 
 
 @_kernel
-def forward(volume, leap, affines, geometry, steps, depth, height, width, rows, columns, image, tile: tl.constexpr):
+def forward(volume, leap, affines, geometry, offsets, depth, height, width, rows, columns, image, tile: tl.constexpr):
     """Line integrals `image` (B, H, W) float32."""
     row, column, on, place = _pixels(rows, columns, tile)
     x, y, z = _unit_rays(geometry, row, column)
-    value, _, _, _, _, _, _ = _moments(volume, leap, affines, steps, x, y, z, on, depth, height, width)
+    value, _, _, _, _, _, _ = _moments(volume, leap, affines, geometry, offsets, x, y, z, on, depth, height, width)
     tl.store(image + place, value.to(tl.float32), mask=on)
 
 
 @_kernel
 def pose_gradient(
-    volume, leap, affines, geometry, steps, depth, height, width, rows, columns, upstream, parts, tile: tl.constexpr
+    volume, leap, affines, geometry, offsets, depth, height, width, rows, columns, upstream, parts, tile: tl.constexpr
 ):
-    """Each tile's part of the gradient by `affines`: `parts` (B, tiles, 3, 4) float64, to be summed by the caller.
+    """Each tile's part of the gradient by `affines` and `offsets`: `parts` (B, tiles, 13) float64.
 
+    The caller sums them.
     No atomics, so that two runs agree bit for bit.
     """
     row, column, on, place = _pixels(rows, columns, tile)
     x, y, z = _unit_rays(geometry, row, column)
-    _, sx, sy, sz, tx, ty, tz = _moments(volume, leap, affines, steps, x, y, z, on, depth, height, width)
+    _, sx, sy, sz, tx, ty, tz = _moments(volume, leap, affines, geometry, offsets, x, y, z, on, depth, height, width)
     weight = tl.load(upstream + place, mask=on, other=0.0)
-    part = parts + (tl.program_id(1).to(tl.int64) * tl.num_programs(0) + tl.program_id(0)) * 12
+    part = parts + (tl.program_id(1).to(tl.int64) * tl.num_programs(0) + tl.program_id(0)) * 13
     _store_row(part, weight, sx, tx, x, y, z)
     _store_row(part + 4, weight, sy, ty, x, y, z)
     _store_row(part + 8, weight, sz, tz, x, y, z)
+    pose = tl.program_id(1)
+    along = _along(affines, pose, 0, sx, x, y, z) + _along(affines, pose, 1, sy, x, y, z)
+    along += _along(affines, pose, 2, sz, x, y, z)
+    tl.store(part + 12, tl.sum(weight * along))
 
 
 @triton.jit
@@ -246,6 +255,13 @@ def _store_row(part, weight, s, t, x, y, z):
     tl.store(part + 1, tl.sum(weight * t * y))
     tl.store(part + 2, tl.sum(weight * t * z))
     tl.store(part + 3, tl.sum(weight * s))
+
+
+@triton.jit
+def _along(affines, pose, row, s, x, y, z):
+    """What one row of the affine has in the derivative along the ray."""
+    a, b, c, _ = _affine_row(affines, pose, row)
+    return s * (a * x + b * y + c * z)
 
 
 @triton.jit
@@ -260,7 +276,7 @@ def jacobian(
     leap,
     affines,
     geometry,
-    steps,
+    offsets,
     depth,
     height,
     width,
@@ -275,7 +291,9 @@ def jacobian(
     """Line integrals `image` (B, H, W), and their derivatives `out` (B, H, W, dofs) along `changes` (B, dofs, 3, 4)."""
     row, column, on, place = _pixels(rows, columns, tile)
     x, y, z = _unit_rays(geometry, row, column)
-    value, sx, sy, sz, tx, ty, tz = _moments(volume, leap, affines, steps, x, y, z, on, depth, height, width)
+    value, sx, sy, sz, tx, ty, tz = _moments(
+        volume, leap, affines, geometry, offsets, x, y, z, on, depth, height, width
+    )
     tl.store(image + place, value.to(tl.float32), mask=on)
     for dof in range(dofs):
         change = changes + (tl.program_id(1) * dofs + dof) * 12
@@ -286,7 +304,7 @@ def jacobian(
 
 @_kernel
 def volume_gradient(
-    affines, geometry, steps, depth, height, width, rows, columns, upstream, gradient, tile: tl.constexpr
+    affines, geometry, offsets, depth, height, width, rows, columns, upstream, gradient, tile: tl.constexpr
 ):
     """Add to `gradient` (depth, height, width) float32. Nothing is skipped: what is empty may well have a gradient.
 
@@ -294,9 +312,9 @@ def volume_gradient(
     """
     row, column, on, place = _pixels(rows, columns, tile)
     x, y, z = _unit_rays(geometry, row, column)
-    step = tl.load(steps + tl.program_id(1))
+    step, offset = tl.load(geometry + 5), tl.load(offsets + tl.program_id(1))
     _, count, along_x, along_y, along_z, fault = _rays(
-        affines, tl.program_id(1), step, x, y, z, on, depth, height, width
+        affines, tl.program_id(1), offset, step, x, y, z, on, depth, height, width
     )
     share = (step * tl.load(upstream + place, mask=on, other=0.0) + fault).to(tl.float32)
     for n in range(tl.max(count)):

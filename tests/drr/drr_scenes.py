@@ -109,9 +109,9 @@ def box_chord(camera: Camera, camera_from_box: Tensor, half_mm: Tensor) -> tuple
 
 
 def truth(volumes: Sequence[Volume], poses: Tensor, camera: Camera, step_mm: float = 1.0) -> Tensor:
-    """Line integrals (B, V, H, W) in float64, sampled by SciPy at the 1st, 2nd, … step from the source.
+    """Line integrals (B, V, H, W) in float64, sampled by SciPy every `step_mm`.
 
-    The step is the one nearest to `step_mm` that puts a sample a quarter of a voxel off the volume's middle.
+    Samples are counted from a quarter of a voxel off the volume's middle.
     """
     ray = unit_rays(camera).numpy()
     images = np.zeros((*poses.shape[:2], *camera.shape))
@@ -121,22 +121,22 @@ def truth(volumes: Sequence[Volume], poses: Tensor, camera: Camera, step_mm: flo
         for b, pose in enumerate(poses[:, v]):
             camera_from_index = (pose @ volume.lps_from_index).numpy()
             distance = np.linalg.norm(camera_from_index[:3] @ [*((n - 1) // 2 + 0.25 for n in data.shape[::-1]), 1])
-            step = distance / round(distance / step_mm) if distance > step_mm / 2 else step_mm
+            offset = distance % step_mm
             depths = corners @ camera_from_index[2, :3] + camera_from_index[2, 3]
             distances = np.linalg.norm(corners @ camera_from_index[:3, :3].T + camera_from_index[:3, 3], axis=1)
-            steps = np.arange(max(1, math.floor(depths.min() / step)), math.ceil(distances.max() / step) + 1)
+            first = max(0, math.floor((depths.min() - offset) / step_mm))
+            along = offset + step_mm * np.arange(first, math.ceil((distances.max() - offset) / step_mm) + 1)
             index_from_camera = np.linalg.inv(camera_from_index)
-            x, y, z = np.moveaxis(index_from_camera[:3, :3] @ ray[..., None], -2, 0) * (steps * step)
+            x, y, z = np.moveaxis(index_from_camera[:3, :3] @ ray[..., None], -2, 0) * along
             points = np.stack([z, y, x]) + index_from_camera[2::-1, 3, None, None, None]
-            images[b, v] = step * ndimage.map_coordinates(data, points, order=1, mode="grid-constant").sum(-1)
+            images[b, v] = step_mm * ndimage.map_coordinates(data, points, order=1, mode="grid-constant").sum(-1)
     return torch.from_numpy(images)
 
 
-def locked_steps(volume: Volume, poses: Tensor, step_mm: float) -> Tensor:
-    """The steps (B,) nearest to `step_mm`, for poses (B, 4, 4), with a sample a quarter of a voxel off the middle."""
+def offsets(volume: Volume, poses: Tensor, step_mm: float) -> Tensor:
+    """Of samples that are counted from a quarter of a voxel off the volume's middle, (B,) mm, for poses (B, 4, 4)."""
     middle = torch.tensor([*((n - 1) // 2 + 0.25 for n in volume.data.shape[::-1]), 1.0], dtype=torch.float64)
-    distance = (poses @ volume.lps_from_index @ middle)[:, :3].norm(dim=1)
-    return distance / (distance.detach() / step_mm).round().clamp(min=1)
+    return (poses @ volume.lps_from_index @ middle)[:, :3].norm(dim=1).remainder(step_mm)
 
 
 def marched(volumes: Sequence[Volume], poses: Tensor, camera: Camera, step_mm: float = 1.0) -> Tensor:
@@ -144,7 +144,7 @@ def marched(volumes: Sequence[Volume], poses: Tensor, camera: Camera, step_mm: f
     images = []
     for v, volume in enumerate(volumes):
         index_from_camera = torch.linalg.inv(poses[:, v] @ volume.lps_from_index)
-        images.append(march(volume.data, index_from_camera, camera, locked_steps(volume, poses[:, v], step_mm)))
+        images.append(march(volume.data, index_from_camera, camera, offsets(volume, poses[:, v], step_mm), step_mm))
     return torch.stack(images, 1)
 
 

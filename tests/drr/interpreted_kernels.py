@@ -9,8 +9,8 @@ import torch
 from drr_scenes import (
     centred,
     facing,
-    locked_steps,
     marched,
+    offsets,
     random_poses,
     relative_error,
     smooth,
@@ -38,8 +38,8 @@ def affines(volume: Volume, poses: Tensor) -> Tensor:
 def by_triton(
     volume: Volume, poses: Tensor, camera: Camera = CAMERA, step_mm: float = 2.0, tile: int = ONE_LARGE_TILE
 ) -> Tensor:
-    steps = locked_steps(volume, poses[:, 0], step_mm)
-    return cuda.project(volume, affines(volume, poses), camera, steps, tile)
+    at = offsets(volume, poses[:, 0], step_mm)
+    return cuda.project(volume, affines(volume, poses), camera, at, step_mm, tile)
 
 
 def error(
@@ -99,7 +99,8 @@ def test_indices_of_a_thousand_cost_no_accuracy():
     data[960:] = sparse((40, 6, 5), torch.Generator().manual_seed(4), 0.3)
     volume = centred(data, (0.5, 0.5, 0.5))
     pose = facing(700.0, (0.002, 0.003, 0.0), -0.7, 0.5)
-    assert error(volume, pose, centred_camera(1000.0, (0.4, 0.4), (14, 12)), 1.0) < TOLERANCE
+    rounding = 6e-5  # of float32 at a thousand voxels
+    assert error(volume, pose, centred_camera(1000.0, (0.4, 0.4), (14, 12)), 1.0) < rounding
 
 
 def test_the_source_inside_and_rays_that_miss():
@@ -114,8 +115,8 @@ def test_a_pose_that_is_not_sane_gives_nan_and_spoils_no_other(value):
     volume = centred(smooth((5, 5, 5), torch.Generator().manual_seed(6)), (4.0, 4.0, 4.0))
     rows = affines(volume, torch.cat([facing(), facing()]))
     rows[0, 1, 3] = value
-    steps = locked_steps(volume, torch.cat([facing(), facing()])[:, 0], 4.0)
-    image = cuda.project(volume, rows, CAMERA, steps, ONE_LARGE_TILE)
+    at = offsets(volume, torch.cat([facing(), facing()])[:, 0], 4.0)
+    image = cuda.project(volume, rows, CAMERA, at, 4.0, ONE_LARGE_TILE)
     assert image[0].isnan().all()
     assert torch.equal(image[1:], by_triton(volume, facing(), step_mm=4.0))
 
@@ -155,15 +156,16 @@ def test_gradients_agree_with_autograd_through_the_march():
 
 
 def test_jacobian_image_agrees_with_the_one_of_the_cpu():
-    """At given steps. How the steps go along is added to both by the operator."""
+    """With samples that stay. How they go along is added to both by the operator."""
     generator = torch.Generator().manual_seed(10)
     volume = centred(smooth((9, 11, 10), generator), (2.1, 1.9, 3.0))
     poses = random_poses(1, 1, generator)
     small = 1e-5 * torch.eye(6, dtype=torch.float64)
     moved = [torch.stack([affines(volume, exp_se3(s) @ poses) for s in steps], 1) for steps in (small, -small)]
-    changes, steps = (moved[0] - moved[1]) / 2e-5, locked_steps(volume, poses[:, 0], 2.0)
-    found = cuda.jacobian(volume, affines(volume, poses), changes, CAMERA, steps, ONE_LARGE_TILE)
-    image, moments = cpu.projection_with_moments(bricked(volume), affines(volume, poses).numpy(), CAMERA, steps.numpy())
+    changes, at = (moved[0] - moved[1]) / 2e-5, offsets(volume, poses[:, 0], 2.0)
+    found = cuda.jacobian(volume, affines(volume, poses), changes, CAMERA, at, 2.0, ONE_LARGE_TILE)
+    numbers = affines(volume, poses).numpy(), CAMERA, at.numpy(), 2.0
+    image, moments = cpu.projection_with_moments(bricked(volume), *numbers)
     expected = jacobian(torch.from_numpy(moments), CAMERA, changes)
     assert relative_error(found[0], torch.from_numpy(image).double()) < TOLERANCE
     for dof in range(6):

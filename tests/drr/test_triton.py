@@ -43,7 +43,7 @@ def test_kernels_compile_for_a_gpu(kernel):
     from femoreg_torch.drr import triton_kernels
 
     function = getattr(triton_kernels, kernel)
-    pointers = dict.fromkeys(("affines", "geometry", "steps", "parts", "changes"), "*fp64")
+    pointers = dict.fromkeys(("affines", "geometry", "offsets", "parts", "changes"), "*fp64")
     pointers |= dict.fromkeys(("image", "upstream", "out", "gradient"), "*fp32")
     pointers |= {"volume": "*fp16", "leap": "*u8", "tile": "constexpr"}
     signature = {name: pointers.get(name, "i32") for name in function.arg_names}
