@@ -23,6 +23,7 @@ from femoreg_torch.case.femoroplasty import DEVICE
 from femoreg_torch.case.model import Case
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import plain, read_json, temporary_file, write_json, write_text
+from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera
 from femoreg_torch.settings import read_record
 from femoreg_torch.volume import Volume, read_ct, read_labels, read_mesh
@@ -51,6 +52,7 @@ class Told:
     device_images: bool = True
     sdd: float = 1.0  # distance from source to detector that is told, of the true one
     ct: ImperfectCt | None = None
+    binned: int = 1  # so many rows and columns of the images averaged into one
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,8 @@ def _ready(condition: Condition, procedure: Procedure, study: Study, out: Imaged
 
 def _origin(condition: Condition, procedure: Procedure, study: Study) -> dict[str, Any]:
     voxels = (REGISTERED_MM, _imaged_mm(procedure))
-    said = {key: value for key, value in asdict(condition.told).items() if value is not None}
+    usual = asdict(Told())
+    said = {key: value for key, value in asdict(condition.told).items() if value != usual[key]}
     told = {"procedure": asdict(procedure), "voxels_mm": voxels, "told": said}
     return plain(told | {"simulation": _content(condition, study)})
 
@@ -243,7 +246,7 @@ def _make_case(condition: Condition, procedure: Procedure, study: Study, body: _
 
         images = body.images(_digest(_content(condition, study)), imaged)
         said = replace(known, case=_said(known.case, condition.told))
-        write_images_and_case(folder, said, images, drawn)
+        write_images_and_case(folder, said, [_binned(view, condition.told.binned) for view in images], drawn)
         if not condition.told.device_images:
             _without_device_images(folder)
         if condition.told.parts:
@@ -255,8 +258,16 @@ def _make_case(condition: Condition, procedure: Procedure, study: Study, body: _
 
 def _said(case: Case, told: Told) -> Case:
     """The case with the C-arm that is told."""
-    camera = replace(case.carm.camera, sdd_mm=case.carm.camera.sdd_mm * told.sdd)
+    camera = replace(case.carm.camera, sdd_mm=case.carm.camera.sdd_mm * told.sdd).downsampled(told.binned)
     return replace(case, carm=replace(case.carm, camera=camera))
+
+
+def _binned(images: ViewImages, factor: int) -> ViewImages:
+    """Images whose pixels are means of so many rows and columns."""
+    if factor == 1:
+        return images
+    fewer = (downsample(image.float(), factor).round().to(image.dtype) for image in (images.anatomy, images.device))
+    return ViewImages(*fewer)
 
 
 def _without_device_images(folder: Path) -> None:

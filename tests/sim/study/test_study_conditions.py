@@ -15,7 +15,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.files import plain
 from femoreg_torch.fluoro import read_image
 from femoreg_torch.geometry import load_carm, rotation_angle, transform_points
-from femoreg_torch.volume import read_mesh
+from femoreg_torch.volume import read_ct, read_mesh
 from sim.commands import phantom
 from sim.study import conditions as module
 from sim.study.cases import Stores
@@ -135,6 +135,20 @@ def test_masks_hide_the_rim_and_table_parts_darken_both_images(imaged: Imaged) -
         share = shown(imaged, "table_parts", kind) / shown(imaged, "uniform", kind)
         assert share.min() < 0.5
         assert 0.9 < share.median() < 1.02
+
+
+def test_binned_images_are_means_and_so_is_their_camera(imaged: Imaged) -> None:
+    binned, whole = (read_case(folder_of(imaged, name)) for name in ("binned", "uniform"))
+    assert binned.carm.camera == whole.carm.camera.downsampled(2)
+    means = shown(imaged, "uniform").unflatten(0, (48, 2)).unflatten(2, (48, 2)).mean((1, 3))
+    torch.testing.assert_close(shown(imaged, "binned"), means, atol=0.51, rtol=0)
+
+
+def test_the_ct_of_a_case_is_spoilt_and_that_of_the_patient_is_not(imaged: Imaged, stores: Stores) -> None:
+    case = read_case(folder_of(imaged, "ct_hu_5_percent_high"))
+    assert case.ct_path is not None
+    patient = read_ct(stores.patients / "somebody" / "1.0" / "ct.nii.gz")
+    torch.testing.assert_close(read_ct(case.ct_path).data.float(), 1.05 * patient.data.float(), atol=0.51, rtol=0)
 
 
 def test_the_focal_length_is_told_wrong_and_nothing_else(imaged: Imaged) -> None:
