@@ -20,8 +20,10 @@ class ObjectQuality:
     views: tuple[ViewQuality, ...]
     in_plane_uncertainty_mm: float  # root mean square disagreement of the views in their image planes
     common_pull: tuple[float, float]  # degrees, mm: where all images together would move it, were all free
-    rotation_deviation_deg: tuple[float, ...]  # standard deviations about the axes of camera 1
-    translation_deviation_mm: tuple[float, ...]  # and along them, of the reference point
+    # Standard deviations about the axes of camera 1, and along them, of the reference point: of the images, and of the
+    # C-arm's intrinsics where its file tells how uncertain these are, or the images do not believe it.
+    rotation_deviation_deg: tuple[float, ...]
+    translation_deviation_mm: tuple[float, ...]
     displacement: tuple[float, float] | None  # degrees, mm from where it was expected, at the reference point
     trusted: bool
     reason: str

@@ -162,5 +162,6 @@ def _carm(carm: CArm) -> str | dict[str, Any]:
     for name in preset_names("carm"):
         if load_carm(name) == carm:
             return name
-    settings = {key: value for key, value in asdict(carm).items() if key != "camera"}
+    untold = {"camera"} if carm.uncertainty else {"camera", "uncertainty"}
+    settings = {key: value for key, value in asdict(carm).items() if key not in untold}
     return asdict(carm.camera) | settings

@@ -39,7 +39,12 @@ class CArm:
     camera: Camera
     isocentre_mm: tuple[float, float, float]  # in the camera frame; the orbit axis passes through it
     orbit_axis: tuple[float, float, float]  # unit vector in the camera frame
-    uncertainty: Uncertainty = Uncertainty()  # of the camera
+    uncertainty: Uncertainty | None = None  # of the camera; None: nobody says
+
+    @property
+    def assumed_uncertainty(self) -> Uncertainty:
+        """What is told, or that of a C-arm that nobody has calibrated."""
+        return self.uncertainty or Uncertainty()
 
     def orbit(self, angle_rad: Tensor) -> Tensor:
         """`moved_camera_from_camera` (..., 4, 4) after the C-arm has turned by `angle_rad` (...) along its orbit.
@@ -81,10 +86,10 @@ def carm_from_dict(settings: dict[str, Any], where: str) -> CArm:
     return CArm(camera, (x, y, z), unit, _uncertainty(settings.get("uncertainty"), f"{where}.uncertainty"))
 
 
-def _uncertainty(settings: Any, where: str) -> Uncertainty:
+def _uncertainty(settings: Any, where: str) -> Uncertainty | None:
     """What a C-arm's file says of its intrinsics; None: nothing. Raises `InputError` that names `where` and the key."""
     if settings is None:
-        return Uncertainty()
+        return None
     known = [f.name for f in fields(Uncertainty)]
     if not isinstance(settings, dict) or (unknown := sorted(set(settings) - set(known))):
         found = repr(settings) if not isinstance(settings, dict) else f"the key {unknown[0]!r}"

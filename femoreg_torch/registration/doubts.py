@@ -32,7 +32,7 @@ def doubts(case: Case, scene: Scene, poses: Poses, covariance: PoseCovariance, l
 
 def doubts_about_the_carm(scene: Scene, covariance: PoseCovariance, limits: Limits) -> tuple[str, ...]:
     """What the images say against the C-arm's file, in words; nan counts as that."""
-    camera, uncertainty, mean = scene.carm.camera, scene.carm.uncertainty, covariance.intrinsics.mean
+    camera, uncertainty, mean = scene.carm.camera, scene.carm.assumed_uncertainty, covariance.intrinsics.mean
     advice = "check the C-arm's file, the pixel size and whether the images are cropped"
     doubts = []
     if not abs(float(mean[0])) <= limits.most_intrinsics_sigma:

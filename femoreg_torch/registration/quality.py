@@ -81,16 +81,27 @@ def assess_cameras(scene: Scene, poses: Poses, covariance: PoseCovariance) -> tu
         CameraQuality(
             camera.sdd_mm,
             camera.principal_point_px,
-            float(deviation[0]) * scene.carm.uncertainty.sdd_percent / 100 * camera.sdd_mm,
+            float(deviation[0]) * scene.carm.assumed_uncertainty.sdd_percent / 100 * camera.sdd_mm,
             shift_px(scene.carm, deviation[1 + 2 * view : 3 + 2 * view]),
         )
         for view, camera in enumerate(cameras)
     )
 
 
+def carm_in_question(scene: Scene, poses: Poses, covariance: PoseCovariance, limits: Limits) -> bool:
+    """Whether the deviations of the poses hold what is not known of the C-arm's intrinsics.
+
+    They do where its file says how uncertain it is, where the intrinsics were refined, and where the images doubt the
+    file; nan counts as that. Otherwise the file is taken at its word, as most are right: what the images alone leave
+    open is the right measure then, and that of a C-arm which nobody has calibrated ten times too large.
+    """
+    believed = float(covariance.intrinsics.mean.abs().max()) <= limits.most_intrinsics_sigma
+    return scene.carm.uncertainty is not None or bool(poses.changes) or not believed
+
+
 def shift_px(carm: CArm, deviations: Tensor) -> tuple[float, float]:
     """A shift (2,) of the principal point in units of the C-arm's uncertainty, as columns and rows."""
-    x, y = (deviations * carm.uncertainty.principal_point_mm).tolist()
+    x, y = (deviations * carm.assumed_uncertainty.principal_point_mm).tolist()
     return x / carm.camera.pixel_mm[1], y / carm.camera.pixel_mm[0]
 
 
@@ -107,7 +118,8 @@ def _assess_object(
     views = tuple(_assess_view(scene, poses, name, images[0], imaging) for images in seen if images)
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
-    rotation, translation = covariance.deviations(name)
+    in_question = carm_in_question(scene, poses, covariance, limits)
+    rotation, translation = covariance.deviations(name) if in_question else covariance.by_images(name)
     pull = covariance.pull(name)
     displacement = _displacement(scene, poses, name)
     reason = (

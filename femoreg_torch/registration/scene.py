@@ -215,7 +215,7 @@ def intrinsics_of(scene: Scene, poses: Poses, objects: Sequence[str]) -> Intrins
 
     `objects` are those drawn.
     """
-    uncertainty, views = scene.carm.uncertainty, len(poses.camera_from_camera1)
+    uncertainty, views = scene.carm.assumed_uncertainty, len(poses.camera_from_camera1)
     scale = [uncertainty.sdd_percent / 100] + 2 * views * [uncertainty.principal_point_mm]
     changes = poses.changes or (CameraChange(),) * views
     offset = [math.log(changes[0].sdd_factor)] + [mm for change in changes for mm in change.principal_point_shift_mm]

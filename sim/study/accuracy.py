@@ -117,8 +117,9 @@ def line_of(record: Record) -> str:
     parts = [f"{key} {found[key]['mm']:.2f} mm {found[key]['deg']:.2f}°" for key in OBJECTS if key in found]
     verdict = "trusted" if record["trusted"] else "flagged"
     wrong = ", WRONG" if run_is_wrong(record) else ""
-    relative = f"relative {found['relative_mm']:.2f} mm"
-    return f"{name} {', '.join(parts)}, {relative}, {record['timings_s']['total']:.0f} s, {verdict}{wrong}"
+    if "relative_mm" in found:
+        parts.append(f"relative {found['relative_mm']:.2f} mm")
+    return f"{name} {', '.join(parts)}, {record['timings_s']['total']:.0f} s, {verdict}{wrong}"
 
 
 def write_results(
@@ -257,10 +258,10 @@ def _doubtful(records: Sequence[Record]) -> Iterable[str]:
             rows.append([name, "–", "–", "–", "–", "refused", record["refused"].split("/")[-1]])
             continue
         found = record["errors"]
-        poses = [f"{found[key]['mm']:.2f} mm, {found[key]['deg']:.2f}°" for key in OBJECTS]
+        poses = [f"{found[key]['mm']:.2f} mm, {found[key]['deg']:.2f}°" if key in found else "–" for key in OBJECTS]
         why = "; ".join(record["reasons"])
         says = "trusted" if record["trusted"] else "flagged"
-        rows.append([name, *poses, f"{found['relative_mm']:.2f} mm", says, why or "–"])
+        rows.append([name, *poses, f"{number(found.get('relative_mm', float('nan')))} mm", says, why or "–"])
     return ["Every run that is wrong or flagged:", table(header, rows)]
 
 

@@ -52,8 +52,15 @@ class Confusion:
     wrong_flagged: int
 
 
+def asked(record: Record) -> list[str]:
+    """The objects that the images of a case show, so that a run should find them."""
+    return record.get("asked", list(OBJECTS))
+
+
 def relative_is_wrong(record: Record) -> bool:
     """Whether entry point and guide tip are more than 4 mm from where they should be to each other, or not known."""
+    if record["refused"] is None and not {"femur", "device"} <= {*asked(record)}:
+        return False
     return record["refused"] is not None or not record["errors"]["relative_mm"] <= WRONG_MM
 
 
@@ -67,13 +74,15 @@ def object_is_wrong(record: Record, name: str) -> bool:
 
 def run_is_wrong(record: Record) -> bool:
     """Whether any object, or entry point against guide tip, is wrong."""
-    return relative_is_wrong(record) or any(object_is_wrong(record, name) for name in OBJECTS)
+    return relative_is_wrong(record) or any(object_is_wrong(record, name) for name in asked(record))
 
 
 def confusion(records: Sequence[Record], name: str | None = None) -> Confusion:
     """Of whole runs, or of one object. A refused run is wrong, and flagged: it gave no pose to trust."""
     counts = {(wrong, trusted): 0 for wrong in (False, True) for trusted in (False, True)}
     for record in records:
+        if name is not None and name not in asked(record):
+            continue
         if name is None:
             wrong, trusted = run_is_wrong(record), record["trusted"]
         else:

@@ -59,6 +59,7 @@ def _measured(case: Case, scene: Scene, truth: Poses, result: Result) -> dict[st
     return {
         "errors": errors(truth, result.poses, points),
         "start_errors": {name: row for name, row in errors(truth, at_start, points).items() if name in OBJECTS},
+        "asked": [name for name in truth.camera1_from if scene.there(scene.objects[name].shown_in, range(scene.views))],
         "landmarks_used": sum(mark.used for mark in result.start.landmarks.values()),
         "trusted": result.verdict.trusted,
         "reasons": list(result.verdict.reasons),

@@ -73,7 +73,9 @@ def test_defaults_of_an_own_carm():
 
 
 def test_what_is_not_said_of_the_uncertainty_is_that_of_a_c_arm_nobody_has_calibrated():
-    assert carm_from_dict(GOOD, "mine").uncertainty == Uncertainty(2.0, 2.0)
+    silent = carm_from_dict(GOOD, "mine")
+    assert silent.uncertainty is None
+    assert silent.assumed_uncertainty == Uncertainty(2.0, 2.0)
     said = carm_from_dict(GOOD | {"uncertainty": {"sdd_percent": 0}}, "mine").uncertainty
     assert said == Uncertainty(sdd_percent=0.0, principal_point_mm=2.0)
 
