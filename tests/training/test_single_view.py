@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 
 from femoreg_torch.drr import project
+from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import about_point, exp_so3, load_carm, rigid, rotation_angle, transform_points
 from femoreg_torch.volume import hu_to_attenuation, read_ct, resample_isotropic
 from training.labelled import LabelledImage
@@ -16,6 +17,8 @@ extends: fast
 steps:
   - {name: "pelvis in view 1, coarse", remove: true}
   - {name: "femur in view 1, coarse", remove: true}
+  - {name: "everything together", imaging: {scatter: 0, tissue: 0}}
+  - {name: "everything together, fine", imaging: {scatter: 0, tissue: 0}}
 """
 
 
@@ -24,7 +27,8 @@ def test_the_pelvis_comes_back(case: Path, tmp_path: Path) -> None:
     camera = load_carm("cios_fusion").camera.downsampled(8)
     ct = read_ct(case / "ct.nii.gz")
     bone = ct.with_data(hu_to_attenuation(ct.data.float().where(ct.data > 300, torch.tensor(-1000.0)), -1000.0))
-    image = project([resample_isotropic(bone, 1.0)], TRUTH[None, None], camera, 1.0)[0]
+    finer = load_carm("cios_fusion").camera.downsampled(2)
+    image = downsample(project([resample_isotropic(bone, 1.0)], TRUTH[None, None], finer, 0.3)[0], 4)
     none = torch.zeros(0)
     labelled = LabelledImage("boxes", image, camera, none, none, none > 0, none, TRUTH)
     middle = TRUTH[:3, 3]
