@@ -2,8 +2,9 @@
 
 A shutter is told from dense bone and from steel by its shape. What is dark and reaches the border must be all that lies
 beyond a circle, straight lines, or both, and nearly all along these the image must drop sharply to nearly black. One
-straight edge alone is not enough: a steel bar along the border looks just like it. Everything is fitted on pixels of
-about 1 mm, in mm on the detector.
+straight edge alone is not enough: a steel bar along the border looks just like it. And shutters close about the middle of
+the image: what leaves only its side is the skin of a flat body, which is nearly as sharp, with air beside it. Everything
+is fitted on pixels of about 1 mm, in mm on the detector.
 """
 
 from collections.abc import Iterator
@@ -20,8 +21,9 @@ from femoreg_torch.geometry import Camera
 
 MARGIN_MM = 2.5  # on the detector, from the edge: the penumbra of a focal spot of 0.6 mm
 _PIXEL_MM = 1.0  # that edges are looked for on
-_LEVELS = 14  # tried as the grey value that parts shadow and field
+_LEVELS = 20  # tried as the grey value that parts shadow and field
 _LEAST_SHADOW, _LEAST_FIELD = 0.02, 0.04  # shares of the detector
+_LEAST_WHOLE = 0.7  # of what is no shadow: one piece; dense bone may cut off others
 _MOST_SIDES = 4
 _MOST_POINTS = 800  # of an edge
 _TRIES = 150  # random circles or lines
@@ -29,7 +31,7 @@ _TOLERANCE_MM = 1.0  # of edge points from a circle or line
 _LEAST_SHARE = 0.06  # of the edge points: what fewer lie on is no side
 _LEAST_DARK = 0.97  # of what lies beyond a side; the rest may be letters
 _NEAR_MM, _FAR_MM = 3.0, 6.0  # from the edge: where grey values on both sides of it are taken
-_MOST_RATIO = 0.35  # of the grey value beyond the edge to that inside
+_MOST_RATIO = 0.45  # of the grey value beyond the edge to that inside
 _LEAST_SHARP = 0.75  # share of the edge that is as dark and as sharp; an instrument may cross the rest
 _SHARP_ENOUGH = 0.97  # to try no other grey value
 _MOST_RESIDUAL_MM = 0.7
@@ -103,6 +105,11 @@ class _Grid:
         rows, columns = np.indices(self.shape)
         return self.at(np.stack([columns, rows], -1).reshape(-1, 2))
 
+    @property
+    def middle(self) -> Array:
+        """The middle of the detector."""
+        return np.asarray((np.array(self.shape[::-1]) - 1) * self.pixel_mm / 2)
+
     def at(self, pixels: NDArray[np.int64]) -> Array:
         """Places of pixels (N, 2), column and row."""
         return np.asarray(pixels * np.array(self.pixel_mm))
@@ -159,7 +166,7 @@ class _Line:
 
     def edge(self, step_mm: float, grid: _Grid) -> Array:
         along = np.array([-self.normal[1], self.normal[0]])
-        middle = (np.array(grid.shape[::-1]) - 1) * grid.pixel_mm / 2
+        middle = grid.middle
         reach = float(np.linalg.norm(middle))
         foot = middle + self.depth(middle) * self.normal
         return np.asarray(foot + np.arange(-reach, reach, step_mm)[:, None] * along)
@@ -200,7 +207,7 @@ def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
     if not _LEAST_SHADOW <= shadow.mean() <= 1 - _LEAST_FIELD:
         return None
     bright = _largest(~shadow)
-    if bright.sum() < (1 - 0.03) * (~shadow).sum():
+    if bright.sum() < _LEAST_WHOLE * (~shadow).sum():
         return None
     sides = _sides(shadow, bright, grid)
     if not sides:
@@ -213,10 +220,10 @@ def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
         here = np.all([other.depth(places) >= -grid.edge_mm for other in sides if other is not side], axis=0)
         places = places[grid.within(places) & here]
         kept, known = _sharp_edge(image, places, side.outwards(places), grid)
+        if len(kept) < 8:
+            continue  # bones, where a grey value is taken that lies within them
         total += known
         sharp += len(kept)
-        if len(kept) < 8:
-            return None
         better = side.refitted(kept)
         for _ in range(2):  # without what lies off
             off = np.abs(better.depth(kept))
@@ -229,7 +236,8 @@ def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
         refined.append(better)
     if sharp < _LEAST_SHARP * total or (len(seen) < 3 and sum(isinstance(side, _Line) for side in refined) < 2):
         return None
-    return _Fit(refined, sharp / total)
+    fit = _Fit(refined, sharp / total)
+    return fit if fit.inside(grid.middle[None]).all() else None
 
 
 def _sharp_edge(image: Array, places: Array, outwards: Array, grid: _Grid) -> tuple[Array, int]:

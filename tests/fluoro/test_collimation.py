@@ -123,6 +123,14 @@ def vignetted() -> Tensor:
     return anatomy(6) * torch.exp(-8 * (away - 0.55).clamp_min(0))
 
 
+def beside_smooth_skin(open_px: float) -> Tensor:
+    """Air in a corner, bounded by trunk and thigh: cylinders whose edges are straight, and nearly as sharp as blades."""
+    inside = ((COLUMN - open_px, 300.0), (0.45 * (COLUMN - open_px / 3) + 0.9 * (ROW - 1.2 * open_px), 300.0))
+    depths = [(0.575 * px).clamp(0, radius) for px, radius in inside]  # mm, at two thirds of the detector's distance
+    chords = [2 * (radius**2 - (radius - d) ** 2).sqrt() for d, (_, radius) in zip(depths, inside, strict=True)]
+    return 50000 * torch.exp(-smooth(0.021 * torch.maximum(*chords), 1.0))
+
+
 UNCOLLIMATED: dict[str, Callable[[], Tensor]] = {
     "plain": lambda: anatomy(7),
     "air": lambda: torch.full((SIZE, SIZE), 50000.0),
@@ -134,6 +142,9 @@ UNCOLLIMATED: dict[str, Callable[[], Tensor]] = {
     "bar at a corner": lambda: steel_bar(slice(0, 200), slice(0, 60)),
     "dark corner": vignetted,
     "very dense patient": lambda: anatomy(8, 5.5),
+    "a little air beside skin": lambda: beside_smooth_skin(80),
+    "air beside skin": lambda: beside_smooth_skin(130),
+    "much air beside skin": lambda: beside_smooth_skin(180),
 }
 
 

@@ -1,0 +1,80 @@
+"""Is anything mirrored? The images are asked whether an object's mirror image fits them better.
+
+Where axes, label map, landmarks or pictures are all mirrored alike, nothing contradicts anything: a mirrored pelvis lies
+nearly where the true one does. But its edges fit worse. An object that is its own mirror image fits equally well.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.geometry import Poses
+from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.imaging import Imaging
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.scene import Body, RigidObject, Scene, reference_point_in_view
+from femoreg_torch.similarity import GradNcc
+from femoreg_torch.volume import Volume
+
+_LEVEL = Level(pixel_mm=3.1, step_mm=2.0)
+_SIMILARITY = GradNcc(patch_radius=5)
+_OPTIMISER = LevenbergMarquardt(max_iterations=8, tol_x=0.05, tol_f=1e-4)
+_SCALE = (0.03, 0.03, 0.03, 2.0, 2.0, 6.0)  # rad and mm: one unit of a motion
+
+
+@dataclass(frozen=True)
+class Handedness:
+    """How well the images fit an object and its mirror image."""
+
+    similarity: float  # mean patch Grad-NCC of its images, at most 1
+    mirrored: float
+
+
+def handedness(scene: Scene, poses: Poses, name: str, imaging: Imaging) -> Handedness:
+    """Compare an object at its pose with its mirror image, fitted to the images from there.
+
+    An object is mirrored at the plane that changes it least for the images, of the three planes through its centre of
+    mass across its principal axes: for a pelvis that is the one between left and right.
+    """
+    images = []
+    for view in range(scene.views):
+        images += scene.there(scene.objects[name].shown_in, (view,))[:1]
+    shown = [other for other in poses.camera1_from if all(scene.shown([other], kind) for kind, _ in images)]
+
+    def cost(thing: RigidObject, iterations: bool) -> float:
+        changed = replace(scene, objects=scene.objects | {name: thing})
+        centre = reference_point_in_view(changed, poses, name, 0)
+        body = Body((name,), 0, centre, torch.tensor(_SCALE, dtype=torch.float64))
+        costs = image_costs(changed, poses, (body,), shown, images, _LEVEL, _SIMILARITY, imaging=imaging)
+        if not iterations:
+            return float(costs(costs.still[None]).mean())
+        return _OPTIMISER.minimise(stage_objective(costs, (body,), None), 6, seed=0).value
+
+    thing = scene.objects[name]
+    candidates = [replace(thing, volume=volume) for volume in mirror_images(thing.volume)]
+    nearest = min(candidates, key=lambda candidate: cost(candidate, iterations=False))
+    return Handedness(1 - cost(thing, iterations=False), 1 - cost(nearest, iterations=True))
+
+
+def mirror_images(volume: Volume) -> list[Volume]:
+    """A volume mirrored at each of the three planes through its centre of mass and across its principal axes."""
+    index = volume.data.nonzero().flip(1).double()  # (N, 3): x, y, z
+    mass = volume.data[volume.data != 0].double()
+    points = index @ volume.lps_from_index[:3, :3].T + volume.lps_from_index[:3, 3]
+    centre = (mass[:, None] * points).sum(0) / mass.sum()
+    away = points - centre
+    axes = torch.linalg.eigh((mass[:, None] * away).T @ away).eigenvectors.T
+    return [_mirrored(volume, centre, axis) for axis in axes]
+
+
+def _mirrored(volume: Volume, point: Tensor, normal: Tensor) -> Volume:
+    """A volume mirrored at a plane; its columns are turned round, so that its axes stay right-handed."""
+    mirror = torch.eye(4, dtype=torch.float64)
+    mirror[:3, :3] -= 2 * torch.outer(normal, normal)
+    mirror[:3, 3] = 2 * (point @ normal) * normal
+    turned_round = torch.eye(4, dtype=torch.float64)
+    turned_round[0, 0] = -1
+    turned_round[0, 3] = volume.data.shape[2] - 1
+    return Volume(volume.data.flip(2).contiguous(), mirror @ volume.lps_from_index @ turned_round)
