@@ -2,9 +2,9 @@
 
 A shutter is told from dense bone and from steel by its shape. What is dark and reaches the border must be all that lies
 beyond a circle, straight lines, or both, and nearly all along these the image must drop sharply to nearly black. One
-straight edge alone is not enough: a steel bar along the border looks just like it. And shutters close about the middle of
-the image: what leaves only its side is the skin of a flat body, which is nearly as sharp, with air beside it. Everything
-is fitted on pixels of about 1 mm, in mm on the detector.
+straight edge alone is not enough: a steel bar along the border looks just like it. And shutters close about the middle
+of the image: what leaves only its side is the skin of a flat body, which is nearly as sharp, with air beside it.
+Everything is fitted on pixels of about 1 mm, in mm on the detector.
 """
 
 from collections.abc import Iterator

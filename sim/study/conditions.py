@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from femoreg_torch.configs import laid_over, load_preset
 from joblib import Parallel, delayed, parallel_config
 from torch import Tensor
@@ -22,13 +21,14 @@ from femoreg_torch.case import new_folder
 from femoreg_torch.case.femoroplasty import DEVICE
 from femoreg_torch.case.model import Case
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import plain, read_json, temporary_file, write_json, write_text
+from femoreg_torch.files import plain, read_json, temporary_file, write_json
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera
 from femoreg_torch.settings import read_record
 from femoreg_torch.volume import Volume, read_ct, read_labels, read_mesh
 from sim.patient import Patient, make_scans
 from sim.study.cases import PROCEDURAL_IMAGED_MM, REAL_IMAGED_MM, REGISTERED_MM, Stores, subject_folder
+from sim.study.faults import FAULTS, read_case_file, write_case_file
 from sim.study.imperfect_ct import ImperfectCt, spoil_ct
 from sim.study.procedures import Procedure, Study
 from sim.theatre import procedure as theatre
@@ -51,8 +51,10 @@ class Told:
     materials: dict[str, str] = field(default_factory=dict)  # told in place of the true ones
     device_images: bool = True
     sdd: float = 1.0  # distance from source to detector that is told, of the true one
+    principal_point_px: float = 0.0  # by which its columns are told too high
     ct: ImperfectCt | None = None
     binned: int = 1  # so many rows and columns of the images averaged into one
+    fault: str | None = None  # what is wrong with the case: a name of `sim.study.faults`
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,12 @@ def read_conditions(name: str | Path, only: Sequence[str] = ()) -> list[Conditio
     """Conditions of a preset in `configs/study/` or of a YAML file, or those of some names. Raises `InputError`."""
     known = read_record(_Conditions, load_preset("study", name), f"conditions {name}").conditions
     names = [condition.name for condition in known]
+    for condition in known:
+        if condition.told.fault not in (None, *FAULTS):
+            raise InputError(
+                f"conditions {name}, {condition.name}: there is no fault {condition.told.fault!r}; there are: "
+                f"{', '.join(FAULTS)}."
+            )
     for wanted in only:
         if wanted not in names:
             raise InputError(f"conditions {name}: there is no {wanted!r}; there are: {', '.join(names)}.")
@@ -253,13 +261,18 @@ def _make_case(condition: Condition, procedure: Procedure, study: Study, body: _
             _name_parts(folder, body.device_seed, condition.told.materials)
         if condition.told.ct is not None:
             spoil_ct(folder, known.head, condition.told.ct)
+        if condition.told.fault is not None:
+            FAULTS[condition.told.fault](folder)
         write_json(folder / _ORIGIN, _origin(condition, procedure, study))
 
 
 def _said(case: Case, told: Told) -> Case:
     """The case with the C-arm that is told."""
-    camera = replace(case.carm.camera, sdd_mm=case.carm.camera.sdd_mm * told.sdd).downsampled(told.binned)
-    return replace(case, carm=replace(case.carm, camera=camera))
+    true = case.carm.camera
+    column, row = true.principal_point_px
+    shifted = (column + told.principal_point_px, row)
+    camera = replace(true, sdd_mm=true.sdd_mm * told.sdd, principal_point_px=shifted)
+    return replace(case, carm=replace(case.carm, camera=camera.downsampled(told.binned)))
 
 
 def _binned(images: ViewImages, factor: int) -> ViewImages:
@@ -272,10 +285,10 @@ def _binned(images: ViewImages, factor: int) -> ViewImages:
 
 def _without_device_images(folder: Path) -> None:
     """Leave only the images of the anatomy in a case; the device stays described."""
-    content = _read_case_file(folder)
+    content = read_case_file(folder)
     for view in content["views"]:
         (folder / view.pop(DEVICE)).unlink()
-    _write_case_file(folder, content)
+    write_case_file(folder, content)
 
 
 def _name_parts(folder: Path, device_seed: int, told: dict[str, str]) -> None:
@@ -285,16 +298,6 @@ def _name_parts(folder: Path, device_seed: int, told: dict[str, str]) -> None:
     for name, mesh in make_device_parts(device_seed).items():
         mesh.export(folder / f"{name}.stl")
         parts.append({"model": f"{name}.stl", "material": told.get(materials[name], materials[name])})
-    content = _read_case_file(folder)
+    content = read_case_file(folder)
     device = {key: value for key, value in content[DEVICE].items() if key not in ("model", "hu")}
-    _write_case_file(folder, content | {DEVICE: {"parts": parts} | device})
-
-
-def _read_case_file(folder: Path) -> dict[str, Any]:
-    content: dict[str, Any] = yaml.safe_load((folder / "case.yaml").read_text(encoding="utf-8"))
-    return content
-
-
-def _write_case_file(folder: Path, content: dict[str, Any]) -> None:
-    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
-    write_text(folder / "case.yaml", text)
+    write_case_file(folder, content | {DEVICE: {"parts": parts} | device})

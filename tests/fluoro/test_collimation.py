@@ -124,7 +124,7 @@ def vignetted() -> Tensor:
 
 
 def beside_smooth_skin(open_px: float) -> Tensor:
-    """Air in a corner, bounded by trunk and thigh: cylinders whose edges are straight, and nearly as sharp as blades."""
+    """Air in a corner, bounded by trunk and thigh: cylinders with straight edges, nearly as sharp as blades."""
     inside = ((COLUMN - open_px, 300.0), (0.45 * (COLUMN - open_px / 3) + 0.9 * (ROW - 1.2 * open_px), 300.0))
     depths = [(0.575 * px).clamp(0, radius) for px, radius in inside]  # mm, at two thirds of the detector's distance
     chords = [2 * (radius**2 - (radius - d) ** 2).sqrt() for d, (_, radius) in zip(depths, inside, strict=True)]

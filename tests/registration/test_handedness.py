@@ -1,0 +1,83 @@
+"""An object is told from its mirror image, and one that is its own mirror image is not doubted."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from registration_scenes import CARM, REFERENCE_POINTS, VOLUMES, float64, make_scene, off, true_poses
+
+from femoreg_torch.drr import project
+from femoreg_torch.geometry import transform_points
+from femoreg_torch.registration import Scene
+from femoreg_torch.registration.doubts import doubts_about_handedness, doubts_about_the_models
+from femoreg_torch.registration.handedness import handedness, mirror_images
+from femoreg_torch.registration.imaging import PLAIN
+from femoreg_torch.volume import Volume, axis_aligned
+
+TRUTH = true_poses()
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(TRUTH)
+
+
+def with_volume(scene: Scene, name: str, volume: Volume) -> Scene:
+    return replace(scene, objects=scene.objects | {name: replace(scene.objects[name], volume=volume)})
+
+
+def line_integrals_of(scene: Scene, view: int) -> torch.Tensor:
+    """The image of all objects of a scene in a view, at their true poses."""
+    where = torch.stack([TRUTH.camera_from(name)[view] for name in scene.objects])[None]
+    return project([thing.volume for thing in scene.objects.values()], where, CARM.camera, 1.0)[0]
+
+
+def test_mirror_images_hold_the_same_values_at_mirrored_places() -> None:
+    volume = VOLUMES["femur"]
+    for mirrored in mirror_images(volume):
+        assert float(torch.linalg.det(mirrored.lps_from_index[:3, :3])) > 0
+        assert mirrored.spacing_mm == pytest.approx(volume.spacing_mm)
+        ends = torch.cartesian_prod(*[float64(0, n - 1) for n in reversed(volume.data.shape)])
+        turned_round = torch.stack([volume.data.shape[2] - 1 - ends[:, 0], ends[:, 1], ends[:, 2]], 1)
+        places = transform_points(volume.lps_from_index, ends)
+        images = transform_points(mirrored.lps_from_index, turned_round)
+        normal = (images - places)[0] / (images - places)[0].norm()
+        heights = (places @ normal) + (images @ normal)
+        torch.testing.assert_close(heights, heights[:1].expand(8))  # all are halved by one plane
+        along = [points - (points @ normal)[:, None] * normal for points in (places, images)]
+        torch.testing.assert_close(along[0], along[1])
+
+
+def test_objects_as_they_are_fit_better_than_their_mirror_images(scene: Scene) -> None:
+    for name in REFERENCE_POINTS:
+        fits = handedness(scene, TRUTH, name, PLAIN)
+        assert fits.similarity > fits.mirrored + 0.02, name
+    assert doubts_about_handedness(scene, TRUTH, PLAIN) == ()
+
+
+def test_a_mirrored_object_is_doubted_though_it_is_a_little_off(scene: Scene) -> None:
+    wrong = with_volume(scene, "pelvis", mirror_images(VOLUMES["pelvis"])[2])
+    here = off(TRUTH.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"], (1, -1, 1), (1, -1, 3))
+    (doubt,) = doubts_about_handedness(wrong, TRUTH.with_object("pelvis", here), PLAIN)
+    assert "the pelvis fits the images better mirrored" in doubt
+
+
+def test_what_is_its_own_mirror_image_is_not_doubted(scene: Scene) -> None:
+    block = torch.zeros(20, 24, 30)
+    block[4:-4, 4:-4, 4:-4] = 0.05
+    box = Volume(block, axis_aligned((3.0, 3.0, 3.0), (-43.5, -34.5, -28.5)))
+    boxed = with_volume(scene, "device", box)
+    device = [line_integrals_of(boxed, view) for view in range(3)]
+    seen = replace(boxed, images={**scene.images, "device": tuple(device)})
+    fits = handedness(seen, TRUTH, "device", PLAIN)
+    assert fits.similarity > 0.8
+    assert fits.mirrored == pytest.approx(fits.similarity, abs=0.004)
+    assert doubts_about_handedness(seen, TRUTH, PLAIN) == ()
+
+
+def test_a_model_of_which_a_part_casts_no_shadow_is_doubted(scene: Scene) -> None:
+    assert doubts_about_the_models(scene, scene) == ()
+    data = VOLUMES["device"].data.clone()
+    data[:, :, 15:] = 0.001
+    (doubt,) = doubts_about_the_models(scene, with_volume(scene, "device", VOLUMES["device"].with_data(data)))
+    assert "of the device's volume casts no shadow" in doubt
