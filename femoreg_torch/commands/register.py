@@ -1,10 +1,11 @@
 """`femoreg register`: from a case folder to poses."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from femoreg_torch.case import Case
+    from femoreg_torch.case import Case, Result
+    from femoreg_torch.registration.workflow import Report
 
 
 def register(
@@ -42,50 +43,76 @@ def register(
         robot: Calibration of the robot, to have the motion in its base frame too: see `femoreg navigate --help`.
         require_trust: End with status 3 if the result is not trusted.
     """
-    import os
-    from dataclasses import replace
-
     from rich.console import Console
     from rich.markup import escape
 
-    from femoreg_torch.case import RESULT_NAME, new_folder, read_case, result_content, write_json
-    from femoreg_torch.case.start_files import read_pixels, read_start_poses
+    from femoreg_torch.case import RESULT_NAME
     from femoreg_torch.commands.status import NOT_TRUSTED
     from femoreg_torch.commands.telling import progress_report, tell_verdict
-    from femoreg_torch.errors import InputError
-    from femoreg_torch.evaluation import EVALUATION_NAMES, evaluate
-    from femoreg_torch.navigation import NAVIGATION_NAMES, navigation_content, read_robot, summary, write_navigation
-    from femoreg_torch.registration.run import network_detector, register_scene
+    from femoreg_torch.navigation import summary
 
-    console, procedure = Console(), read_case(case)
-    tool = None if procedure.plan is None else procedure.plan.tool
-    calibration = None if robot is None or tool is None else read_robot(robot, tool)
-    if robot is not None and (tool is None or not _is_seen(procedure, tool)):
-        raise InputError(f"{case}: --robot was given, but there is no tool to steer, or no view has an image of it.")
+    console = Console()
     with progress_report(console, "reading the case") as report:
-        result, scene = register_scene(
-            procedure,
-            None,
-            preset,
-            seed=seed,
-            find=None if weights is None else network_detector(procedure, weights),
-            landmarks=None if landmarks is None else read_pixels(landmarks),
-            start=None if start is None else read_start_poses(start),
-            report=report,
+        result, navigation = register_into(
+            out, case, preset, seed, weights=weights, landmarks=landmarks, start=start, robot=robot, report=report
         )
-    result = replace(
-        result, errors=evaluate(procedure, result, scene), case=os.path.relpath(case.resolve(), out.resolve())
-    )
-    navigation = None if result.object_from_tool is None else navigation_content(result, calibration)
-    with new_folder(out, without=(*EVALUATION_NAMES, *NAVIGATION_NAMES, "replay.gif")) as folder:
-        write_json(folder / RESULT_NAME, result_content(result))
-        if navigation is not None:
-            write_navigation(folder, navigation)
     tell_verdict(console, result)
     for line in [] if navigation is None else summary(navigation):
         console.print(line)
     console.print(f"Result written to {escape(str(out / RESULT_NAME))} ({result.timings_s['total']:.0f} s).")
     return NOT_TRUSTED if require_trust and not result.verdict.trusted else 0
+
+
+def register_into(
+    out: Path,
+    folder: Path,
+    preset: str,
+    seed: int,
+    *,
+    weights: Path | None = None,
+    landmarks: Path | None = None,
+    start: Path | None = None,
+    robot: Path | None = None,
+    report: "Report | None" = None,
+) -> "tuple[Result, dict[str, Any] | None]":
+    """Register the case in a folder and write all that belongs to its run into `out`; see `register`.
+
+    Returns the result, and the content of navigation.json if there is any. Raises `InputError`.
+    """
+    import os
+    from dataclasses import replace
+
+    from femoreg_torch.case import RESULT_NAME, new_folder, read_case, result_content, write_json
+    from femoreg_torch.case.start_files import read_pixels, read_start_poses
+    from femoreg_torch.errors import InputError
+    from femoreg_torch.evaluation import EVALUATION_NAMES, evaluate
+    from femoreg_torch.navigation import NAVIGATION_NAMES, navigation_content, read_robot, write_navigation
+    from femoreg_torch.registration.run import network_detector, register_scene, silent
+
+    case = read_case(folder)
+    tool = None if case.plan is None else case.plan.tool
+    calibration = None if robot is None or tool is None else read_robot(robot, tool)
+    if robot is not None and (tool is None or not _is_seen(case, tool)):
+        raise InputError(f"{folder}: --robot was given, but there is no tool to steer, or no view has an image of it.")
+    result, scene = register_scene(
+        case,
+        None,
+        preset,
+        seed=seed,
+        find=None if weights is None else network_detector(case, weights),
+        landmarks=None if landmarks is None else read_pixels(landmarks),
+        start=None if start is None else read_start_poses(start),
+        report=report or silent,
+    )
+    result = replace(
+        result, errors=evaluate(case, result, scene), case=os.path.relpath(folder.resolve(), out.resolve())
+    )
+    navigation = None if result.object_from_tool is None else navigation_content(result, calibration)
+    with new_folder(out, without=(*EVALUATION_NAMES, *NAVIGATION_NAMES, "replay.gif")) as built:
+        write_json(built / RESULT_NAME, result_content(result))
+        if navigation is not None:
+            write_navigation(built, navigation)
+    return result, navigation
 
 
 def _is_seen(case: "Case", tool: str) -> bool:

@@ -12,7 +12,9 @@ from femoreg_torch.geometry import Camera, project_points, transform_points
 from femoreg_torch.volume import Volume
 
 _BLOCK_MM = 6.0  # longest edge of a block of a solid whose parts nobody names
-_SPREAD = 0.4  # standard deviation of the logarithm of attenuation within one material, blocks being fitted so well
+# Standard deviation of the logarithm of attenuation within one material, blocks being fitted so well. A solid of one
+# material is common, and a second one would be the fit's noise; where there are several anyhow, they are told apart.
+_SPREAD_OF_ONE, _SPREAD_OF_SEVERAL = 0.4, 0.2
 _MOST_MATERIALS = 4
 _LEAST_ATTENUATION = 0.01  # 1/mm: what is below is as good as air
 
@@ -83,8 +85,8 @@ def region_paths(share: Volume, owner: Tensor, count: int, camera_from_volume: T
 def materials(attenuation: Doubles, weights: Indices) -> tuple[Indices, Doubles]:
     """Few materials that blocks are of: the number of each block's, and what they attenuate.
 
-    The fewest, at most four, within which the logarithm of the attenuation, weighted, spreads by no more than 0.4:
-    k-means on a line (Lloyd, IEEE Trans Inf Theory 28 (1982) 129), from quantiles.
+    The fewest, at most four, within which the logarithm of the attenuation, weighted, spreads by no more than 0.4 (one)
+    or 0.2 (several): k-means on a line (Lloyd, IEEE Trans Inf Theory 28 (1982) 129), from quantiles.
     """
     logarithm = np.log(np.maximum(attenuation, _LEAST_ATTENUATION))
     order = np.argsort(logarithm)
@@ -97,6 +99,6 @@ def materials(attenuation: Doubles, weights: Indices) -> tuple[Indices, Doubles]
             sums = np.bincount(nearest, weights * logarithm, count)
             middles = np.where(total > 0, sums / np.maximum(total, 1), middles)
         spread = np.sqrt(np.average((logarithm - middles[nearest]) ** 2, weights=weights))
-        if spread <= _SPREAD:
+        if spread <= (_SPREAD_OF_ONE if count == 1 else _SPREAD_OF_SEVERAL):
             break
     return nearest, np.exp(middles)

@@ -31,6 +31,16 @@ from femoreg_torch.registration.start import (
 from femoreg_torch.registration.workflow import Report, run_plan
 
 
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on, by name."""
+    return {
+        "femoreg_torch": femoreg_torch.__version__,
+        "torch": torch.__version__,
+        "numpy": numpy.__version__,
+        "python": platform.python_version(),
+    }
+
+
 def silent(step: str, share: float) -> None:
     """A report that tells nobody."""
 
@@ -130,12 +140,7 @@ def register_scene(
         },
         preset=plan.preset,
         seed=seed,
-        versions={
-            "femoreg_torch": femoreg_torch.__version__,
-            "torch": torch.__version__,
-            "numpy": numpy.__version__,
-            "python": platform.python_version(),
-        },
+        versions=versions(),
     )
     return result, scene
 

@@ -180,6 +180,7 @@ def test_the_installed_overview_is_quick_and_complete() -> None:
     done = subprocess.run([FEMOREG, "--help"], capture_output=True, encoding="utf-8", check=True)
     assert time.perf_counter() - start < 2  # 0.15 s on an idle machine: no command is imported
     for name in (
+        "batch",
         "dataset",
         "demo",
         "detect",

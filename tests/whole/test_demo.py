@@ -1,6 +1,9 @@
 """The demo from end to end, its accuracy, and the same procedure under other label ids and with other presets."""
 
+import csv
 import json
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -123,3 +126,38 @@ def test_a_registration_starts_where_a_file_says(
     )
     assert any("outlines" in note for note in begun["skipped"])
     assert "outlines" in capsys.readouterr().out
+
+
+def test_a_batch_keeps_what_is_done_and_tells_what_was_refused(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    preset, runs = tmp_path / "one_step.yaml", tmp_path / "runs"
+    preset.write_text(ONE_STEP)
+    cases = [tmp_path / name for name in ("first", "second", "broken")]
+    for case in cases:
+        shutil.copytree(demo / "case", case)
+    (cases[2] / "view1.tif").unlink()
+    arguments = ["batch", *map(str, cases), "--out", str(runs), "--preset", str(preset), "--jobs", "2"]
+
+    def table() -> dict[str, dict[str, str]]:
+        with (runs / "table.csv").open(encoding="utf-8") as file:
+            return {row["case"]: row for row in csv.DictReader(file)}
+
+    assert main(arguments) == 2
+    rows = table()
+    assert list(rows) == ["first", "second", "broken"]
+    assert [row["status"] for row in rows.values()] == ["done", "done", "refused"]
+    assert "view1.tif" in rows["broken"]["reasons"]
+    assert rows["first"]["trusted"] == "false"
+    assert float(rows["first"]["pelvis_mm"]) == pytest.approx(
+        result_of(runs / "first")["errors"]["pelvis"]["mm"], abs=1e-4
+    )
+    assert rows["first"]["pelvis_mm"] == rows["second"]["pelvis_mm"]
+    assert not (runs / "broken").exists()
+    later = (runs / "second" / "result.json").stat().st_mtime + 10
+    os.utime(cases[1] / "view1.tif", (later, later))
+    shutil.copy(demo / "case" / "view1.tif", cases[2] / "view1.tif")
+    capsys.readouterr()
+    assert main([*arguments, "--require-trust"]) == 3
+    assert [row["status"] for row in table().values()] == ["kept", "done", "done"]
+    assert "first" in capsys.readouterr().out

@@ -1,0 +1,227 @@
+"""`femoreg batch`: many cases registered, several at a time, each run kept as soon as it is done."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from femoreg_torch.case import Result
+
+
+@dataclass(frozen=True)
+class Job:
+    """One case, and how it is registered."""
+
+    case: Path
+    out: Path
+    preset: str
+    seed: int
+    weights: Path | None
+    threads: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of one case: a line of the table."""
+
+    case: str
+    status: str  # done, kept (from an earlier run), refused or failed
+    trusted: bool
+    reasons: str
+    seconds: float
+    errors: dict[str, float]  # mm and degrees by name, where the case has a truth
+
+
+def batch(
+    cases: list[Path],
+    *,
+    out: Path,
+    preset: str = "fast",
+    seed: int = 0,
+    weights: Path | None = None,
+    jobs: int = 1,
+    again: bool = False,
+    require_trust: bool = False,
+) -> int:
+    """Register many cases, several at a time, and write one table of what became of them.
+
+    The run of each case is written to OUT/NAME, where NAME is that of its folder, as `femoreg register` writes it, as
+    soon as it is done. Started again after it was killed, the command goes on with the cases that are missing: what
+    was registered by the same preset, seed and versions since the case was last changed is kept. A case that is refused
+    does not stop the others. The table is OUT/table.csv. Status 2 if a case was refused or failed.
+
+    Args:
+        cases: Case folders, each with case.yaml.
+        out: Folder of the runs and of the table.
+        preset: Workflow, as for `femoreg register`.
+        seed: Of the random searches.
+        weights: Weights of the landmark network, if not those shipped.
+        jobs: Cases at the same time. The cores are shared among them; each needs some 2 GB of memory.
+        again: Register all cases anew.
+        require_trust: End with status 3 if a result is not trusted.
+    """
+    from rich.console import Console
+
+    from femoreg_torch.commands.status import BAD_INPUT, DONE, NOT_TRUSTED
+    from femoreg_torch.commands.telling import progress_report
+
+    console = Console()
+    waiting = _jobs(cases, out, preset, seed, weights, jobs)
+    out.mkdir(parents=True, exist_ok=True)
+    rows = {} if again else {job.case: row for job in waiting if (row := kept(job)) is not None}
+    left = [job for job in waiting if job.case not in rows]
+    with progress_report(console, f"{len(left)} cases") as report:
+        for done, (job, row) in enumerate(run_jobs(left, jobs), 1):
+            rows[job.case] = row
+            report(f"{done} of {len(left)}: {row.case} {row.status}", done / len(left))
+            _write_table([rows[job.case] for job in waiting if job.case in rows], out / "table.csv")
+    table = [rows[job.case] for job in waiting]
+    _write_table(table, out / "table.csv")
+    _tell(console, table)
+    console.print(f"Table written to {out / 'table.csv'}.", markup=False)
+    if any(row.status in ("refused", "failed") for row in table):
+        return BAD_INPUT
+    return NOT_TRUSTED if require_trust and not all(row.trusted for row in table) else DONE
+
+
+def _jobs(cases: Sequence[Path], out: Path, preset: str, seed: int, weights: Path | None, count: int) -> list[Job]:
+    """What is to be done. Raises `InputError` for cases that would be written to one place, and for no jobs."""
+    import os
+
+    from femoreg_torch.errors import InputError
+    from femoreg_torch.registration import load_plan
+
+    if count < 1:
+        raise InputError(f"--jobs: at least 1 was expected, got {count}.")
+    load_plan(preset)  # complains once, not for every case
+    names = [case.resolve().name for case in cases]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(
+                f"{names.count(name)} cases are called {name!r}: their runs would be one folder. Rename them."
+            )
+    threads = max(1, len(os.sched_getaffinity(0)) // count)
+    return [Job(case, out / name, preset, seed, weights, threads) for case, name in zip(cases, names, strict=True)]
+
+
+def kept(job: Job) -> Row | None:
+    """The row of a run that is there already; None if it is to be made, as case or settings have changed since."""
+    from femoreg_torch.case import RESULT_NAME, read_result
+    from femoreg_torch.errors import InputError
+    from femoreg_torch.registration import load_plan
+    from femoreg_torch.registration.run import versions
+
+    path = job.out / RESULT_NAME
+    if not path.is_file():
+        return None
+    try:
+        result = read_result(job.out)
+    except InputError:
+        return None  # of another version, or broken: it is made anew
+    if (result.preset, result.seed, result.versions) != (load_plan(job.preset).preset, job.seed, versions()):
+        return None
+    sources = [*job.case.rglob("*"), Path(job.preset), *([job.weights] if job.weights else [])]
+    changed = max((file.stat().st_mtime for file in sources if file.is_file()), default=float("inf"))
+    return _row(job, "kept", result) if changed <= path.stat().st_mtime else None
+
+
+def run_jobs(waiting: Sequence[Job], count: int, run: Callable[[Job], Row] | None = None) -> Iterator[tuple[Job, Row]]:
+    """Run `run`, by default `run_job`, in `count` processes at a time; each job is told when it is done.
+
+    Where a process is killed, those that ran beside it are begun anew, one after another; a case that ends its process
+    again is told as failed.
+    """
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from concurrent.futures.process import BrokenProcessPool
+    from multiprocessing import get_context
+
+    def attempt(some: Sequence[Job], at_once: int) -> Iterator[tuple[Job, Row | None]]:
+        with ProcessPoolExecutor(at_once, get_context("spawn")) as pool:
+            running = {pool.submit(run or run_job, job): job for job in some}
+            try:
+                for future in as_completed(running):
+                    try:
+                        yield running[future], future.result()
+                    except BrokenProcessPool:
+                        yield running[future], None
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+    lost = []
+    for job, row in attempt(waiting, count) if waiting else ():
+        if row is None:
+            lost.append(job)
+        else:
+            yield job, row
+    for job in lost:
+        for _, row in attempt([job], 1):
+            yield job, row or _bad(job, "failed", "its process was killed, perhaps for lack of memory", 0.0)
+
+
+def run_job(job: Job) -> Row:
+    """Register one case in this process; what goes wrong becomes a row."""
+    import time
+    import traceback
+
+    import torch
+
+    from femoreg_torch.commands.register import register_into
+    from femoreg_torch.errors import InputError
+
+    torch.set_num_threads(job.threads)
+    began = time.perf_counter()
+    try:
+        result, _ = register_into(job.out, job.case, job.preset, job.seed, weights=job.weights)
+    except (InputError, OSError) as error:
+        return _bad(job, "refused", " ".join(str(error).split()), time.perf_counter() - began)
+    except Exception as error:  # a defect: told with its place, and the other cases go on
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        told = f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno})"
+        return _bad(job, "failed", " ".join(told.split()), time.perf_counter() - began)
+    return _row(job, "done", result)
+
+
+def _bad(job: Job, status: str, reason: str, seconds: float) -> Row:
+    return Row(job.out.name, status, False, reason, seconds, {})
+
+
+def _row(job: Job, status: str, result: "Result") -> Row:
+    verdict = result.verdict
+    errors: dict[str, float] = {}
+    for name, value in (result.errors or {}).items():
+        if isinstance(value, dict):
+            errors |= {f"{name}_mm": value["mm"], f"{name}_deg": value["deg"]}
+        else:
+            errors[name] = value
+    reasons = "" if verdict.trusted else "; ".join(verdict.reasons)
+    return Row(job.out.name, status, verdict.trusted, reasons, result.timings_s.get("total", 0.0), errors)
+
+
+def _write_table(rows: Sequence[Row], path: Path) -> None:
+    import csv
+
+    from femoreg_torch.files import temporary_file
+
+    names = list(dict.fromkeys(name for row in rows for name in row.errors))
+    with temporary_file(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["case", "status", "trusted", "seconds", *names, "reasons"])
+        for row in rows:
+            errors = [f"{row.errors[name]:.4f}" if name in row.errors else "" for name in names]
+            trusted = "" if row.status in ("refused", "failed") else str(row.trusted).lower()
+            writer.writerow([row.case, row.status, trusted, f"{row.seconds:.1f}", *errors, row.reasons])
+
+
+def _tell(console: "Console", rows: Sequence[Row]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("case", "", "trusted", "s", "why not")
+    for row in rows:
+        trusted = "[green]yes[/]" if row.trusted else "[bold red]no[/]"
+        table.add_row(escape(row.case), row.status, trusted, f"{row.seconds:.0f}", escape(row.reasons))
+    console.print(table)
