@@ -23,6 +23,7 @@ MARGIN_MM = 2.5  # on the detector, from the edge: the penumbra of a focal spot 
 _PIXEL_MM = 1.0  # that edges are looked for on
 _LEVELS = 20  # tried as the grey value that parts shadow and field
 _LEAST_SHADOW, _LEAST_FIELD = 0.02, 0.04  # shares of the detector
+_LEAST_CORNERS = 3  # of the detector that a circle, or two blades, put in the dark
 _LEAST_WHOLE = 0.7  # of what is no shadow: one piece; dense bone may cut off others
 _MOST_SIDES = 4
 _MOST_POINTS = 800  # of an edge
@@ -204,7 +205,7 @@ def _levels(image: Array) -> Iterator[float]:
 def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
     """The field of a shutter whose shadow is darker than `level`."""
     shadow = _reaching_the_border(image < level)
-    if not _LEAST_SHADOW <= shadow.mean() <= 1 - _LEAST_FIELD:
+    if not _LEAST_SHADOW <= shadow.mean() <= 1 - _LEAST_FIELD or _dark_corners(shadow) < _LEAST_CORNERS:
         return None
     bright = _largest(~shadow)
     if bright.sum() < _LEAST_WHOLE * (~shadow).sum():
@@ -263,6 +264,11 @@ def _reaching_the_border(mask: Mask) -> Mask:
     _, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     rim = np.concatenate([parts[0], parts[-1], parts[:, 0], parts[:, -1]])
     return np.isin(parts, np.unique(rim[rim > 0]))
+
+
+def _dark_corners(shadow: Mask) -> int:
+    """How many corners of the detector lie in a shadow."""
+    return int(sum(corner.mean() > 0.5 for half in (shadow[:3], shadow[-3:]) for corner in (half[:, :3], half[:, -3:])))
 
 
 def _largest(mask: Mask) -> Mask:

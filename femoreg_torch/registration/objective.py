@@ -95,7 +95,7 @@ class ImageCosts:
     def __call__(self, deltas: Tensor) -> Tensor:
         """Costs (P, images) of deltas (P, Σ n_b)."""
         apart = deltas.split(1) if self._intrinsics(deltas) else [deltas]  # one camera draws a batch
-        return torch.cat([torch.stack([t.cost(self._drawn(t, part)) for t in self.targets], 1) for part in apart])
+        return torch.cat([self._costs(part) for part in apart])
 
     @property
     def still(self) -> Tensor:
@@ -104,16 +104,31 @@ class ImageCosts:
 
     def quadratics(self, delta: Tensor) -> list[Quadratic]:
         """Each image's cost about one delta (Σ n_b,), with exact gradient and positive semi-definite curvature."""
-        return [self._quadratic(target, delta) for target in self.targets]
+        drawn: dict[tuple[int, str], tuple[Tensor, Tensor]] = {}
+        return [self._quadratic(target, delta, drawn) for target in self.targets]
 
-    def _drawn(self, target: _Target, deltas: Tensor) -> Tensor:
-        """Line integrals (P, H, W) of deltas that have the intrinsics of the first one."""
-        drawn = target.background.expand(len(deltas), *target.camera.shape)
-        if target.moving:
-            volumes = [self.objects[name].volume for name in target.moving]
-            camera = self._camera(target, deltas)
-            drawn = drawn + project(volumes, self._placed(target, deltas), camera, self.step_mm)
-        return drawn
+    def _costs(self, deltas: Tensor) -> Tensor:
+        """Costs (P, images) of deltas that have the intrinsics of the first one.
+
+        What images of one view show alike is drawn once.
+        """
+        costs = []
+        drawn: dict[int, tuple[tuple[str, ...], Tensor]] = {}  # by view, what was drawn last
+        for target in self.targets:
+            image = target.background.expand(len(deltas), *target.camera.shape)
+            if target.moving:
+                names, moving = drawn.get(target.view, ((), torch.zeros(())))
+                if not set(names) <= set(target.moving):
+                    names, moving = (), torch.zeros(())
+                left = [name for name in target.moving if name not in names]
+                if left:
+                    volumes = [self.objects[name].volume for name in left]
+                    placed = self._placed(target, deltas, left)
+                    moving = moving + project(volumes, placed, self._camera(target, deltas), self.step_mm)
+                drawn[target.view] = target.moving, moving
+                image = image + moving
+            costs.append(target.cost(image))
+        return torch.stack(costs, 1)
 
     def _intrinsics(self, deltas: Tensor) -> list[tuple[Intrinsics, Tensor]]:
         """The intrinsics among the bodies, with their part of the deltas (P, n): one or none."""
@@ -127,31 +142,36 @@ class ImageCosts:
             camera = camera.changed(intrinsics.changes(part[0])[target.view])
         return camera
 
-    def _placed(self, target: _Target, deltas: Tensor) -> Tensor:
-        """Poses (P, O, 4, 4) of the target's moving objects."""
+    def _placed(self, target: _Target, deltas: Tensor, names: Sequence[str]) -> Tensor:
+        """Poses (P, O, 4, 4) of moving objects in the target's view."""
         parts = zip(self.bodies, split(deltas, self.bodies), strict=True)
         motions = [(body, body.motion(part)) for body, part in parts if isinstance(body, Body)]
-        placed = [_camera_from(name, target.view, self.poses, motions, len(deltas)) for name in target.moving]
+        placed = [_camera_from(name, target.view, self.poses, motions, len(deltas)) for name in names]
         for intrinsics, part in self._intrinsics(deltas):
             placed = [intrinsics.slides(part)[:, target.view] @ pose for pose in placed]
         return torch.stack(placed, 1)
 
-    def _quadratic(self, target: _Target, delta: Tensor) -> Quadratic:
+    def _quadratic(
+        self, target: _Target, delta: Tensor, seen: dict[tuple[int, str], tuple[Tensor, Tensor]]
+    ) -> Quadratic:
+        """The cost of one image; `seen` holds what was drawn already, image and Jacobian by view and object."""
         n = len(delta)
         if not target.moving:
             cost = float(target.cost(target.background[None]))
             return Quadratic(cost, delta.new_zeros(1, n), delta.new_zeros(n, n))
         drawn, jacobians, twists = target.background, [], []
-        placed = self._placed(target, delta[None])[0]  # (O, 4, 4)
+        placed = self._placed(target, delta[None], target.moving)[0]  # (O, 4, 4)
         camera = self._camera(target, delta[None])
         refining = self._intrinsics(torch.eye(n, dtype=torch.float64))
         by_rays = torch.zeros(*camera.shape, 3)  # derivatives by the intrinsics
         for name, pose, change in zip(target.moving, placed, self._changes(target, delta), strict=True):
             volume = self.objects[name].volume
             centre = transform_points(pose, self.objects[name].reference_point[None])[0]
-            image, jacobian = project_with_jacobian(
-                volume, pose[None], camera, centre, self.step_mm, intrinsics=bool(refining)
-            )
+            if (target.view, name) not in seen:
+                seen[target.view, name] = project_with_jacobian(
+                    volume, pose[None], camera, centre, self.step_mm, intrinsics=bool(refining)
+                )
+            image, jacobian = seen[target.view, name]
             drawn = drawn + image[0]
             jacobians.append(jacobian[0, ..., :6])
             twists.append(_twists(change, pose, centre))
@@ -172,7 +192,7 @@ class ImageCosts:
         steps = _STEP * torch.eye(len(delta), dtype=torch.float64)
         for _, chosen in self._intrinsics(torch.eye(len(delta), dtype=torch.float64)):
             steps = steps - _STEP * chosen @ chosen.T
-        placed = self._placed(target, torch.cat([delta + steps, delta - steps]))  # (2 n, O, 4, 4)
+        placed = self._placed(target, torch.cat([delta + steps, delta - steps]), target.moving)  # (2 n, O, 4, 4)
         above, below = placed.chunk(2)
         return ((above - below) / (2 * _STEP)).movedim(0, 1)
 

@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from registration_scenes import REFERENCE_POINTS, VOLUMES, float64, make_scene, off, segmentations, true_poses
 
+from femoreg_torch.registration import objective
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import Prior, image_costs, stage_objective
@@ -53,14 +55,14 @@ def _joint_objective(  # type: ignore[no-untyped-def]
 def test_the_gradient_is_the_slope_of_the_values_and_the_curvature_is_never_negative(
     weights: tuple[Weighting, ...], imaging: Imaging, similarity: Similarity
 ) -> None:
-    objective = _joint_objective(Prior(rotation_deg=5, translation_mm=10, weight=0.1), weights, imaging, similarity)
+    joint = _joint_objective(Prior(rotation_deg=5, translation_mm=10, weight=0.1), weights, imaging, similarity)
     delta = 0.3 * torch.randn(30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    model = objective.quadratic(delta)
+    model = joint.quadratic(delta)
     h = 0.04 if imaging.scatter else 0.02  # with less contrast a small step drowns in single precision
     moved = delta + h * torch.cat([torch.eye(30), -torch.eye(30)]).double()
-    values = objective(moved)
+    values = joint(moved)
     slope = (values[:30] - values[30:]) / (2 * h)
-    assert abs(model.value - float(objective(delta[None])[0])) < 1e-7
+    assert abs(model.value - float(joint(delta[None])[0])) < 1e-7
     assert (model.gradient - slope).norm() < 0.03 * slope.norm()
     assert torch.linalg.eigvalsh(model.hessian).min() > 0
 
@@ -71,12 +73,12 @@ def test_at_the_solution_the_curvature_is_that_of_the_values() -> None:
     scene = make_scene(poses)
     body = Body(("pelvis", "femur"), 0, reference_point_in_view(scene, poses, "pelvis", 0), _SCALE)
     costs = image_costs(scene, poses, (body,), ("pelvis", "femur"), [("anatomy", 0)], _LEVEL, _SIMILARITY)
-    objective = stage_objective(costs, (body,), None)
-    hessian = objective.quadratic(torch.zeros(6, dtype=torch.float64)).hessian
+    single = stage_objective(costs, (body,), None)
+    hessian = single.quadratic(torch.zeros(6, dtype=torch.float64)).hessian
     for axis in range(5):
         step = torch.zeros(3, 6, dtype=torch.float64)
         step[0, axis], step[2, axis] = -0.6, 0.6
-        below, here, above = objective(step).tolist()
+        below, here, above = single(step).tolist()
         assert abs((below + above - 2 * here) / 0.6**2 / float(hessian[axis, axis]) - 1) < 0.25, axis
 
 
@@ -99,3 +101,35 @@ def test_a_scene_without_soft_tissue_draws_none() -> None:
         for imaging in (Imaging(), Imaging(tissue=1.0))
     )
     assert torch.equal(plain(nothing), asked(nothing))
+
+
+def test_what_two_images_of_a_view_show_alike_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    poses = true_poses()
+    scene = make_scene(poses)
+    bodies = tuple(
+        Body((name,), 0, reference_point_in_view(scene, poses, name, 0), _SCALE) for name in REFERENCE_POINTS
+    )
+    render, images = tuple(REFERENCE_POINTS), [(kind, view) for view in (2, 0) for kind in ("device", "anatomy")]
+    together = image_costs(scene, poses, bodies, render, images, _LEVEL, _SIMILARITY)
+    apart = [image_costs(scene, poses, bodies, render, [image], _LEVEL, _SIMILARITY) for image in images]
+    deltas = 0.3 * torch.randn(3, 18, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    torch.testing.assert_close(together(deltas), torch.cat([costs(deltas) for costs in apart], 1), atol=1e-6, rtol=0)
+    for one, alone in zip(together.quadratics(deltas[0]), (c.quadratics(deltas[0])[0] for c in apart), strict=True):
+        torch.testing.assert_close(one.gradient, alone.gradient)
+        torch.testing.assert_close(one.hessian, alone.hessian)
+    drawn: list[str] = []
+    for name in ("project", "project_with_jacobian"):
+        whole = getattr(objective, name)
+
+        def counted(*arguments: Any, name: str = name, whole: Any = whole, **options: Any) -> Any:
+            drawn.append(name)
+            return whole(*arguments, **options)
+
+        monkeypatch.setattr(objective, name, counted)
+    together.quadratics(deltas[0])
+    assert drawn == ["project_with_jacobian"] * 6  # three objects in two views
+    drawn.clear()
+    anatomy_first = image_costs(scene, poses, bodies, render, sorted(images), _LEVEL, _SIMILARITY)
+    drawn.clear()
+    anatomy_first(deltas)
+    assert drawn == ["project"] * 4  # the bones of two views, then the device in each
