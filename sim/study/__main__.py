@@ -223,7 +223,7 @@ def conditions(
         runs.append((condition, records))
     command = f"python -m sim.study conditions --preset {preset} --first {len(chosen)}"
     command += f" --only {only}" if only else ""
-    print(write_conditions(runs, preset, command, folder, docs))
+    print(write_conditions(runs, preset, first, command, folder, docs))
 
 
 def listing(first: int | None = None, kind: Kind = "all", out: Path = _OUT) -> None:

@@ -17,8 +17,13 @@ _AXES = ("IS", "LR", "AP")
 Run = tuple[Condition, Sequence[Record]]
 
 
-def write_conditions(runs: Sequence[Run], preset: str, command: str, out: Path, docs: Path | None) -> str:
-    """Write runs and statistics of every condition into `out`, and the section into `docs`, if given; returns it."""
+def write_conditions(
+    runs: Sequence[Run], preset: str, first: int | None, command: str, out: Path, docs: Path | None
+) -> str:
+    """Write runs and statistics of every condition into `out`, and the section into `docs`, if given; returns it.
+
+    The section is that of the `first` so many procedures; others keep theirs.
+    """
     for condition, records in runs:
         folder = out / condition.name
         folder.mkdir(parents=True, exist_ok=True)
@@ -28,7 +33,8 @@ def write_conditions(runs: Sequence[Run], preset: str, command: str, out: Path, 
         write_json(folder / "summary.json", {"preset": preset, "statistics": found, "coverage": covered})
     text = section(runs, preset, command)
     if docs:
-        write_section(docs, f"Conditions: `{preset}`", text)
+        some = "" if first is None else f", first {first} procedures"
+        write_section(docs, f"Conditions: `{preset}`{some}", text)
     return text
 
 
