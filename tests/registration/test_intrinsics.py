@@ -161,13 +161,24 @@ def test_a_file_far_from_what_the_images_fit_is_told(scene: Scene) -> None:
     wrong = _wrong(scene, 1.10)
     poses = true_poses().with_changes((CameraChange(1 / 1.10),) * 3)
     covariance = final_covariance(wrong, poses)
-    (doubt,) = doubts_about_the_carm(wrong, covariance, Limits())
+    (doubt,) = doubts_about_the_carm(wrong, poses, covariance, Limits())
     assert "the C-arm's file says 1122 mm" in doubt
     assert "a source distance of 10" in doubt
     camera = assess_cameras(wrong, poses, covariance)[0]
     assert camera.sdd_mm == pytest.approx(1020)
     assert 0 < camera.sdd_deviation_mm < 0.02 * 1020
-    assert doubts_about_the_carm(scene, final_covariance(scene, true_poses()), Limits()) == ()
+    assert doubts_about_the_carm(scene, true_poses(), final_covariance(scene, true_poses()), Limits()) == ()
+
+
+@pytest.mark.parametrize(("shift_mm", "doubted"), [(0.9, False), (2.4, True)])
+def test_a_principal_point_that_refinement_moved_far_is_told(scene: Scene, shift_mm: float, doubted: bool) -> None:
+    """Two millimetres of the file are one deviation; the images themselves are those of a right file."""
+    poses = true_poses()
+    covariance = final_covariance(scene, poses)
+    still, shifted = CameraChange(), CameraChange(principal_point_shift_mm=(0.3, -shift_mm))
+    told = doubts_about_the_carm(scene, poses.with_changes((still, shifted, still)), covariance, Limits())
+    assert len(told) == doubted
+    assert all("principal point of view 2 by 2.4 mm" in doubt for doubt in told)
 
 
 def test_a_wrong_file_that_was_not_refined_is_not_trusted(scene: Scene) -> None:
