@@ -23,6 +23,8 @@ def doctor() -> int:
     from rich.markup import escape
     from rich.table import Table
 
+    from femoreg_torch.commands.status import AMISS, DONE
+
     console = Console()
     findings = [*software(), *machine(), *network()]
     with console.status("checking the projector"):
@@ -38,7 +40,7 @@ def doctor() -> int:
         console.print(f"[bold red]{escape(finding.what)}:[/] {escape(finding.amiss or '')}")
     if not amiss:
         console.print("[green]Nothing is amiss.[/]")
-    return 1 if amiss else 0
+    return AMISS if amiss else DONE
 
 
 def software() -> list[Finding]:

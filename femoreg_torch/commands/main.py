@@ -27,8 +27,8 @@ GROUP = "femoreg_torch.commands"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `femoreg` with these arguments (those of the process if None) and return its exit status.
 
-    0: done; 2: bad input, told in one line on stderr; 3: done, but not trusted; 130: interrupted. Whatever
-    else goes wrong is a defect of this program and keeps its traceback.
+    0: done; 1: `doctor` found something amiss; 2: bad input, told in one line on stderr; 3: done, but not trusted;
+    130: interrupted. Whatever else goes wrong is a defect of this program and keeps its traceback.
     """
     # Threads that wait actively for one another cost ten times the processor time where others use the machine too.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")

@@ -1,3 +1,3 @@
 """Exit statuses of `femoreg`."""
 
-DONE, BAD_INPUT, NOT_TRUSTED, INTERRUPTED = 0, 2, 3, 130
+DONE, AMISS, BAD_INPUT, NOT_TRUSTED, INTERRUPTED = 0, 1, 2, 3, 130
