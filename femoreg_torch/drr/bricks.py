@@ -54,12 +54,26 @@ def _build(data: NDArray[np.float32], version: int) -> BrickedVolume:
     bricks = [-(-(n + 2 * RIM) // BRICK) for n in data.shape]
     padded = np.zeros([b * BRICK for b in bricks], np.float32)
     padded[tuple(slice(RIM, RIM + n) for n in data.shape)] = data
-    # A sample reads the voxel below it and the one above, and lies up to SPREAD from the middle of its packet.
-    near = ndimage.maximum_filter(padded != 0, size=2 * SPREAD + 2, origin=-1)
-    filled = near.reshape(bricks[0], BRICK, bricks[1], BRICK, bricks[2], BRICK).any((1, 3, 5))
+    filled = padded != 0
+    for axis in range(3):
+        filled = _any_near_bricks(filled, axis)
     depth, height, width = data.shape
     if filled.any():
         leap = ndimage.distance_transform_cdt(~filled, metric="chessboard").clip(0, 255).astype(np.uint8)
     else:
         leap = np.full(filled.shape, 255, np.uint8)
     return BrickedVolume(padded, leap, (depth, height, width), version)
+
+
+def _any_near_bricks(voxels: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
+    """Whether samples within SPREAD of a brick read any voxel that is set, along one axis, for each brick there.
+
+    A sample reads the voxel below it and the one above.
+    """
+    along = np.moveaxis(voxels, axis, 0)
+    rim = np.zeros((BRICK, *along.shape[1:]), bool)
+    padded = np.concatenate([rim, along, rim])
+    found = np.zeros((len(along) // BRICK, *along.shape[1:]), bool)
+    for shift in range(-SPREAD, BRICK + SPREAD + 1):
+        found |= padded[BRICK + shift :: BRICK][: len(found)]
+    return np.moveaxis(found, 0, axis)

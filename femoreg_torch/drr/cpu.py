@@ -290,6 +290,28 @@ def _scatter(affines, detector, offsets, step, workers, upstream, parts):  # typ
                             mine[n + r, j + q, i + p] += np.float32(share * portion)
 
 
+@_parallel
+def _by_parameters(moments, detector, changes, slides, out):  # type: ignore[no-untyped-def]
+    """Derivatives (B, n, H, W) from moments (B, H, W, 6), see `jacobian`."""
+    poses, count, rows, columns = out.shape
+    identity = np.eye(3)
+    for line in nb.prange(poses * rows):
+        pose, row = line // rows, line % rows
+        for column in range(columns):
+            mine = moments[pose, row, column]
+            if mine[0] == 0.0 and mine[1] == 0.0 and mine[2] == 0.0:  # a ray that meets nothing
+                continue
+            x, y, z, _, _, _ = _ray(identity, detector, row, column)
+            for n in range(count):
+                change, slide = changes[pose, n], slides[pose, n]
+                total = 0.0
+                for i in range(3):
+                    of_ray = change[i, 0] * x + change[i, 1] * y + change[i, 2] * z
+                    along = slide[i, 0] * x + slide[i, 1] * y + slide[i, 2] * z
+                    total += mine[3 + i] * of_ray + mine[i] * (change[i, 3] + along)
+                out[pose, n, row, column] = total
+
+
 # What the operator calls ---------------------------------------------------------------------------------------------
 def _detector(camera: Camera) -> Array:
     return np.array([camera.sdd_mm, *camera.pixel_mm, *camera.principal_point_px])
@@ -340,6 +362,18 @@ def projection_with_moments(
         volume.padded, volume.leap, padded, _detector(camera), offsets, step_mm, edges, workers, image, moments
     )
     return image, moments
+
+
+def jacobian(moments: NDArray[np.float32], camera: Camera, changes: Array, slides: Array) -> NDArray[np.float32]:
+    """Derivatives (B, n, H, W) of images by n parameters, from moments (B, H, W, 6), see `drr.moments`.
+
+    `changes` (B, n, 3, 4) are the derivatives of the affines with respect to the parameters. With `slides` (B, n, 3, 3)
+    the samples slide along each unit ray u by that matrix times u, in index space.
+    """
+    out = np.zeros((*changes.shape[:2], *camera.shape), np.float32)
+    numbers = (np.ascontiguousarray(values, np.float64) for values in (changes, slides))
+    _by_parameters(moments, _detector(camera), *numbers, out)
+    return out
 
 
 def volume_gradient(

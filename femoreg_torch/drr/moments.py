@@ -33,15 +33,3 @@ def offset_gradient(moments: Tensor, affines: Tensor, camera: Camera, upstream: 
     """Gradient (B,) float64 of Σ upstream · image by the offsets; affines (B, 3, 4), upstream (B, H, W)."""
     directions = torch.einsum("hwj,bij->bhwi", unit_rays(camera), affines[:, :, :3].to(torch.float32))
     return ((moments[..., :3] * directions).sum(-1) * upstream).sum((1, 2), dtype=torch.float64)
-
-
-def jacobian(moments: Tensor, camera: Camera, changes: Tensor) -> Tensor:
-    """Derivatives (B, H, W, n) of images by n parameters, from moments (B, H, W, 6).
-
-    `changes` (B, n, 3, 4) are the derivatives of the affines with respect to the parameters.
-    """
-    rays = unit_rays(camera)
-    outer = moments[..., 3:, None] * rays[..., None, :]  # (B, H, W, 3, 3)
-    full = torch.cat([outer, moments[..., :3, None]], -1).flatten(-2).flatten(1, 2)  # (B, H · W, 12)
-    columns = full @ changes.to(full.dtype).flatten(-2).mT
-    return columns.unflatten(1, moments.shape[1:3])

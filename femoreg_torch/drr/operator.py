@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from femoreg_torch.drr import cpu, cuda
 from femoreg_torch.drr.bricks import bricked
-from femoreg_torch.drr.moments import affine_gradient, jacobian, offset_gradient, unit_rays
+from femoreg_torch.drr.moments import affine_gradient, offset_gradient, unit_rays
 from femoreg_torch.drr.reference import march
 from femoreg_torch.drr.sampling import middle_of, offset_rates, offsets_of
 from femoreg_torch.errors import InputError
@@ -70,8 +70,8 @@ def project_with_jacobian(
     The twist moves the object after its pose: about `centre` (3,) in mm in the camera frame, along the camera's axes,
     (rotation in rad, translation in mm), taken at zero. With `intrinsics`, three more columns (B, H, W, 9) are the
     derivatives by the intrinsics: the logarithm of the source distance, and the principal point along x and y in mm on
-    the detector. `camera_from_volume` is (B, 4, 4). On the CPU, or on CUDA with Triton; raises
-    `InputError` where it cannot.
+    the detector. In memory the derivatives lie image by image, not pixel by pixel. `camera_from_volume` is (B, 4, 4).
+    On the CPU, or on CUDA with Triton; raises `InputError` where it cannot.
     """
     _check([volume], camera_from_volume[:, None])
     with torch.no_grad():
@@ -80,36 +80,40 @@ def project_with_jacobian(
         middle = middle_of(volume, camera_from_volume)
         generators = _twist_generators(centre.to(index_from_camera))
         velocities = (generators[:, :3, :3] @ middle[:, None, :, None])[..., 0] + generators[:, :3, 3]  # (B, 6, 3)
-        rates = offset_rates(middle, velocities).to(torch.float32)[:, None, None]
+        rates = offset_rates(middle, velocities)
         # To move the object is to move the camera's points in it the other way.
         changes = -affines[:, None] @ generators
         if intrinsics:
             changes = torch.cat([changes, affines[:, None] @ _ray_generators(camera).to(index_from_camera)], 1)
-    image, derivatives = _with_derivatives(volume, affines, changes, camera, offsets_of(middle, step_mm), step_mm)
-    rays = unit_rays(camera).to(image.device)
-    along = -(derivatives[..., 3:6] * rays).sum(-1, keepdim=True)  # of samples that go along each ray
-    moved = derivatives[..., :6] + rates * along
-    if not intrinsics:
-        return image, moved
-    turned, stretched = derivatives[..., 6:9], derivatives[..., 9:]
-    shares = torch.einsum("hwi,nij,hwj->hwn", rays, _ray_generators(camera)[:3, :3, :3].to(rays), rays)
-    return image, torch.cat([moved, turned - shares * stretched], -1)
+            rates = torch.nn.functional.pad(rates, (0, 4))
+    image, planes = _with_derivatives(volume, affines, changes, rates, camera, offsets_of(middle, step_mm), step_mm)
+    if intrinsics:
+        rays = unit_rays(camera).to(image.device)
+        turned, stretched = planes[:, 6:9], planes[:, 9:]
+        shares = torch.einsum("hwi,nij,hwj->nhw", rays, _ray_generators(camera)[:3, :3, :3].to(rays), rays)
+        planes = torch.cat([planes[:, :6], turned - shares * stretched], 1)
+    return image, planes.movedim(1, -1)
 
 
 def _with_derivatives(
-    volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, offsets: Tensor, step_mm: float
+    volume: Volume, affines: Tensor, changes: Tensor, rates: Tensor, camera: Camera, offsets: Tensor, step_mm: float
 ) -> tuple[Tensor, Tensor]:
-    """Images (B, H, W) and their derivatives (B, H, W, n) by parameters that change the affines by (B, n, 3, 4).
+    """Images (B, H, W) and their derivatives (B, n, H, W) by parameters that change the affines by (B, n, 3, 4).
 
-    Samples stay whole steps beyond `offsets` (B,) mm.
+    Samples stay whole steps beyond `offsets` (B,) mm, which change by `rates` (B, n).
     """
     if volume.data.device.type == "cpu":
         numbers = affines.numpy(), camera, offsets.numpy(), step_mm
         image, moments = cpu.projection_with_moments(bricked(volume), *numbers)
-        return torch.from_numpy(image), jacobian(torch.from_numpy(moments), camera, changes)
+        slides = rates[:, :, None, None] * affines[:, None, :, :3]
+        planes = cpu.jacobian(moments, camera, changes.numpy(), slides.numpy())
+        return torch.from_numpy(image), torch.from_numpy(planes)
     if reason := cuda.why_not(volume):
         raise InputError(f"project_with_jacobian: {reason}. Move the volume to the CPU, or use Triton on CUDA.")
-    return cuda.jacobian(volume, affines, changes, camera, offsets, step_mm)
+    image, derivatives = cuda.jacobian(volume, affines, changes, camera, offsets, step_mm)
+    along = -(derivatives[..., 3:6] * unit_rays(camera).to(image.device)).sum(-1, keepdim=True)
+    moved = derivatives + rates.to(torch.float32)[:, None, None] * along
+    return image, moved.movedim(-1, 1)
 
 
 def _twist_generators(centre: Tensor) -> Tensor:

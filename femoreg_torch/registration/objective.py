@@ -105,7 +105,12 @@ class ImageCosts:
     def quadratics(self, delta: Tensor) -> list[Quadratic]:
         """Each image's cost about one delta (Σ n_b,), with exact gradient and positive semi-definite curvature."""
         drawn: dict[tuple[int, str], tuple[Tensor, Tensor]] = {}
-        return [self._quadratic(target, delta, drawn) for target in self.targets]
+        steps = _STEP * torch.eye(len(delta), dtype=torch.float64)
+        for _, chosen in self._intrinsics(torch.eye(len(delta), dtype=torch.float64)):
+            steps = steps - _STEP * chosen @ chosen.T
+        around = torch.cat([delta[None], delta + steps, delta - steps])  # (1 + 2 n, n)
+        motions = self._motions(around)
+        return [self._quadratic(target, around, motions, drawn) for target in self.targets]
 
     def _costs(self, deltas: Tensor) -> Tensor:
         """Costs (P, images) of deltas that have the intrinsics of the first one.
@@ -113,6 +118,7 @@ class ImageCosts:
         What images of one view show alike is drawn once.
         """
         costs = []
+        motions = self._motions(deltas)
         drawn: dict[int, tuple[tuple[str, ...], Tensor]] = {}  # by view, what was drawn last
         for target in self.targets:
             image = target.background.expand(len(deltas), *target.camera.shape)
@@ -123,7 +129,7 @@ class ImageCosts:
                 left = [name for name in target.moving if name not in names]
                 if left:
                     volumes = [self.objects[name].volume for name in left]
-                    placed = self._placed(target, deltas, left)
+                    placed = self._placed(target, deltas, motions, left)
                     moving = moving + project(volumes, placed, self._camera(target, deltas), self.step_mm)
                 drawn[target.view] = target.moving, moving
                 image = image + moving
@@ -142,29 +148,44 @@ class ImageCosts:
             camera = camera.changed(intrinsics.changes(part[0])[target.view])
         return camera
 
-    def _placed(self, target: _Target, deltas: Tensor, names: Sequence[str]) -> Tensor:
-        """Poses (P, O, 4, 4) of moving objects in the target's view."""
+    def _motions(self, deltas: Tensor) -> list[tuple[Body, Tensor]]:
+        """The rigid bodies with their motions (P, 4, 4)."""
         parts = zip(self.bodies, split(deltas, self.bodies), strict=True)
-        motions = [(body, body.motion(part)) for body, part in parts if isinstance(body, Body)]
+        return [(body, body.motion(part)) for body, part in parts if isinstance(body, Body)]
+
+    def _placed(
+        self, target: _Target, deltas: Tensor, motions: Sequence[tuple[Body, Tensor]], names: Sequence[str]
+    ) -> Tensor:
+        """Poses (P, O, 4, 4) of moving objects in the target's view."""
         placed = [_camera_from(name, target.view, self.poses, motions, len(deltas)) for name in names]
         for intrinsics, part in self._intrinsics(deltas):
             placed = [intrinsics.slides(part)[:, target.view] @ pose for pose in placed]
         return torch.stack(placed, 1)
 
     def _quadratic(
-        self, target: _Target, delta: Tensor, seen: dict[tuple[int, str], tuple[Tensor, Tensor]]
+        self,
+        target: _Target,
+        around: Tensor,
+        motions: Sequence[tuple[Body, Tensor]],
+        seen: dict[tuple[int, str], tuple[Tensor, Tensor]],
     ) -> Quadratic:
-        """The cost of one image; `seen` holds what was drawn already, image and Jacobian by view and object."""
+        """The cost of one image about the first of deltas (1 + 2 n, n), the others being steps up and down from it.
+
+        `seen` holds what was drawn already, image and Jacobian by view and object.
+        """
+        delta = around[0]
         n = len(delta)
         if not target.moving:
             cost = float(target.cost(target.background[None]))
             return Quadratic(cost, delta.new_zeros(1, n), delta.new_zeros(n, n))
         drawn, jacobians, twists = target.background, [], []
-        placed = self._placed(target, delta[None], target.moving)[0]  # (O, 4, 4)
+        every = self._placed(target, around, motions, target.moving).movedim(1, 0)  # (O, 1 + 2 n, 4, 4)
+        # Derivatives (O, n, 4, 4) of the poses by the bodies' motions, by central differences, good to some 1e-9.
+        rates = (every[:, 1 : n + 1] - every[:, n + 1 :]) / (2 * _STEP)
         camera = self._camera(target, delta[None])
         refining = self._intrinsics(torch.eye(n, dtype=torch.float64))
-        by_rays = torch.zeros(*camera.shape, 3)  # derivatives by the intrinsics
-        for name, pose, change in zip(target.moving, placed, self._changes(target, delta), strict=True):
+        by_rays = torch.zeros(3, *camera.shape)  # derivatives by the intrinsics
+        for name, pose, change in zip(target.moving, every[:, 0], rates, strict=True):
             volume = self.objects[name].volume
             centre = transform_points(pose, self.objects[name].reference_point[None])[0]
             if (target.view, name) not in seen:
@@ -173,28 +194,20 @@ class ImageCosts:
                 )
             image, jacobian = seen[target.view, name]
             drawn = drawn + image[0]
-            jacobians.append(jacobian[0, ..., :6])
+            planes = jacobian[0].movedim(-1, 0)
+            jacobians.append(planes[:6])
             twists.append(_twists(change, pose, centre))
             for intrinsics, _ in refining:
                 sliding = intrinsics.slide_rates(target.view, camera.sdd_mm).to(jacobian.dtype)
-                by_rays = by_rays + jacobian[0, ..., 6:] + jacobian[0, ..., 3:6] @ sliding.T
+                by_rays = by_rays + planes[6:] + torch.tensordot(sliding, planes[3:6], 1)
         for intrinsics, chosen in refining:
             jacobians.append(by_rays)
             twists.append(intrinsics.by_delta(target.view) @ chosen.T)
         # Six twists per object, and three intrinsics of the view, span all that the deltas do to this image.
-        changes = torch.cat(jacobians, -1) * target.imaging.slope(drawn)[..., None]
-        cost, scores, hessian = similarity_quadratic(target.similarity, target.seen(drawn), changes)
+        changes = torch.cat(jacobians) * target.imaging.slope(drawn)
+        cost, scores, hessian = similarity_quadratic(target.similarity, target.seen(drawn), changes.movedim(0, -1))
         by_delta = torch.cat(twists)  # (6 O, or 6 O + 3, n)
         return Quadratic(cost, scores @ by_delta, by_delta.T @ hessian @ by_delta)
-
-    def _changes(self, target: _Target, delta: Tensor) -> Tensor:
-        """Derivatives (O, n, 4, 4) of the poses by the bodies' motions, by central differences, good to some 1e-9."""
-        steps = _STEP * torch.eye(len(delta), dtype=torch.float64)
-        for _, chosen in self._intrinsics(torch.eye(len(delta), dtype=torch.float64)):
-            steps = steps - _STEP * chosen @ chosen.T
-        placed = self._placed(target, torch.cat([delta + steps, delta - steps]), target.moving)  # (2 n, O, 4, 4)
-        above, below = placed.chunk(2)
-        return ((above - below) / (2 * _STEP)).movedim(0, 1)
 
 
 def _twists(changes: Tensor, pose: Tensor, centre: Tensor) -> Tensor:

@@ -90,12 +90,19 @@ class FixedGradNcc:
 
     def curvature(self, image: Tensor, changes: Tensor, stride: int) -> Tensor:
         """Gauss–Newton hessian (n, n) float64 about an image (H, W) with changes (n, H, W); every stride-th patch."""
+        if image.device.type == "cpu" and image.dtype == changes.dtype == torch.float32:
+            average, slope = (taps.float().numpy() for taps in self.taps)
+            numbers = (t.contiguous().numpy() for t in (image, changes, self.fixed, self.scale, self.weights))
+            factors = cpu.curvature_factors(*numbers, self.radius, stride, FLAT, average, slope)
+            of_pixels, of_means, along = (torch.from_numpy(factor).flatten(1) for factor in factors)
+            both = of_pixels @ of_pixels.T - of_means @ of_means.T - along @ along.T
+            return both.to(torch.float64) / 2  # the cost is the mean over both derivatives
         maps = image_gradients(torch.cat([image[None], changes]), self.taps)  # (1 + n, 2, H, W)
         along_columns, along_rows = (
             patch_curvature(maps[0, d], maps[1:, d], self.fixed[d], self.scale[d], self.weights, self.radius, stride)
             for d in range(2)
         )
-        return (along_columns + along_rows) / 2  # the cost is the mean over both derivatives
+        return (along_columns + along_rows) / 2
 
     def _reference(self, images: Tensor) -> Tensor:
         """Weighted mean NCC (B,) in plain torch."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.similarity import cpu
 from femoreg_torch.similarity.interface import FixedSimilarity, SmoothFixedSimilarity
 
 _TILE_PX = 44  # edge of a tile; as that of Grad-NCC with patches of radius 5
@@ -45,6 +46,8 @@ def similarity_quadratic(similarity: FixedSimilarity, image: Tensor, jacobian: T
 
 def tile_scores(changes: Tensor, slope: Tensor, tile: int) -> Tensor:
     """The gradient by square tiles, (T, n) float64: of an image that changes by (n, H, W) and slopes by (1, H, W)."""
+    if changes.device.type == "cpu" and changes.dtype == slope.dtype == torch.float32:
+        return torch.from_numpy(cpu.tile_sums(changes.contiguous().numpy(), slope[0].contiguous().numpy(), tile)).T
     return (
         F.avg_pool2d(changes[:, None] * slope, tile, ceil_mode=True, divisor_override=1).flatten(1).T.to(torch.float64)
     )
