@@ -8,10 +8,6 @@ import torch
 
 from femoreg_torch.optimize.result import BestSoFar, Objective, Result, Stop
 
-with warnings.catch_warnings():  # cma warns where matplotlib is missing, which only its plots need
-    warnings.simplefilter("ignore", UserWarning)
-    import cma
-
 
 @dataclass(frozen=True)
 class CmaEs:
@@ -30,6 +26,9 @@ class CmaEs:
 
         The final mean of the distribution is evaluated too: on a noisy objective it is often the better point.
         """
+        with warnings.catch_warnings():  # cma warns where matplotlib is missing, which only its plots need
+            warnings.simplefilter("ignore", UserWarning)
+            import cma  # takes most of a second, and few presets use it
         track = BestSoFar(objective)
         options = {
             "popsize": self.population,

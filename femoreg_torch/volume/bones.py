@@ -71,7 +71,7 @@ def bone_labels(
     order = anatomy.bone_names if anatomy else ()
     names = [*(name for name in order if name in table), *(name for name in table if name not in order)]
     data = labels.data.numpy()
-    counts = np.bincount(data.ravel())
+    counts = torch.bincount(labels.data.flatten()).numpy()
     # bones of the anatomy have their own numbers, whatever else is in the table
     number = {name: 1 + order.index(name) for name in names if name in order}
     number |= {name: n for n, name in enumerate((name for name in names if name not in order), 1 + len(order))}
@@ -84,7 +84,7 @@ def bone_labels(
         mirror = anatomy.bone(name).mirror if anatomy and name in order else name
         if mirror in number and number[mirror] > number[name] and set(table[name]) & set(table[mirror]):
             _part_sides(labels.with_data(found), name, mirror, number, anatomy, landmarks)
-    present = set(np.flatnonzero(np.bincount(found.numpy().ravel())).tolist())
+    present = set(torch.bincount(found.flatten()).nonzero()[:, 0].tolist())
     return BoneLabels(
         labels.with_data(found),
         {name: n for name, n in number.items() if n in present},
