@@ -2,7 +2,7 @@
 
 from femoreg_torch.fluoro.collimation import Shutter, exposed_field, find_shutter, without_penumbra
 from femoreg_torch.fluoro.field import Circle, Polygon
-from femoreg_torch.fluoro.intensity import attenuation_image, downsample
+from femoreg_torch.fluoro.intensity import attenuation_image, binned, downsample
 from femoreg_torch.fluoro.reading import check_matches, read_image, write_image
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "Polygon",
     "Shutter",
     "attenuation_image",
+    "binned",
     "check_matches",
     "downsample",
     "exposed_field",

@@ -8,6 +8,9 @@ from torch.nn import functional as F
 
 from femoreg_torch.errors import InputError
 
+_MOST_ATTENUATION = 12.0  # of a patient: 45 cm of water at 60 keV are 9
+_DARKEST = 60.0  # attenuation of which float32 can still take the intensity
+_SPARSE = 8  # every so many-th pixel tells what half of an image is
 _SIGMA_PX = math.sqrt(2.0)  # of the smoothing that finds I0: variance 2 px², as xReg does (itkIntensLogTrans)
 
 
@@ -30,3 +33,15 @@ def downsample(image: Tensor, factor: int) -> Tensor:
     """Block averages (..., H // factor, W // factor), float32, of images (..., H, W); as `Camera.downsampled`."""
     coarse = F.avg_pool2d(image.float().reshape(-1, 1, *image.shape[-2:]), factor)
     return coarse.reshape(*image.shape[:-2], *coarse.shape[-2:])
+
+
+def binned(attenuation: Tensor, factor: int) -> Tensor:
+    """An attenuation image (H, W) as a detector with pixels so many times larger sees it, (H // factor, W // factor).
+
+    Such pixels average intensities. Where half of the image is darker than any patient, the values are no natural
+    logarithms of intensities (but grey values, say) and are averaged themselves.
+    """
+    least = attenuation.min()
+    if attenuation[::_SPARSE, ::_SPARSE].median() - least > _MOST_ATTENUATION:
+        return downsample(attenuation, factor)
+    return least - downsample((least - attenuation).clamp_min(-_DARKEST).exp(), factor).log()

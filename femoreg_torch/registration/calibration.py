@@ -34,7 +34,16 @@ from femoreg_torch.geometry import (
     transform_points,
 )
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.regions import Doubles, Indices, blocks_of, materials, region_paths, touching_faces
+from femoreg_torch.registration.regions import (
+    Doubles,
+    Indices,
+    RegionVoxels,
+    blocks_of,
+    materials,
+    region_paths,
+    region_voxels,
+    touching_faces,
+)
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.registration.weights import dilated
 from femoreg_torch.volume import Volume
@@ -129,14 +138,14 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
     share = thing.volume.with_data(_share(thing))
     if thing.materials_known and len(thing.parts) > 1:
         owner, attenuation = _told(thing.parts)
-        device = _Device(name, kind, share, owner, len(attenuation))
+        device = _device(name, kind, share, owner, len(attenuation))
         seen = _views(scene, poses, device)
         if not seen:
             return None
         fit, evaluations = _begin(seen, attenuation), 0
     else:
         blocks, count = blocks_of(share)
-        device = _Device(name, kind, share, blocks, count, touching_faces(blocks))
+        device = _device(name, kind, share, blocks, count, touching_faces(blocks))
         seen = _views(scene, poses, device)
         if not seen:
             return None
@@ -144,7 +153,7 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
         poses, fit, seen, used = _settled(scene, poses, device, fit, seen)
         material, attenuation = materials(fit[:count], np.bincount(blocks[blocks >= 0].numpy(), minlength=count))
         fit = np.concatenate([attenuation, fit[count:]])
-        device = _Device(name, kind, share, torch.from_numpy(np.append(material, -1))[blocks], len(attenuation))
+        device = _device(name, kind, share, torch.from_numpy(np.append(material, -1))[blocks], len(attenuation))
         evaluations += used
     poses, fit, seen, used = _settled(scene, poses, device, fit, seen)
     attenuation = fit[: device.regions]
@@ -170,12 +179,19 @@ class _Device:
     share: Volume  # of every voxel that is inside
     owner: Tensor  # (Z, Y, X): the region of every voxel, −1 where it is empty
     regions: int
-    touching: Indices | None = None  # (n, 3): pairs of regions, and the faces between them
+    voxels: RegionVoxels
+    touching: Indices | None  # (n, 3): pairs of regions, and the faces between them
 
     def filled(self, attenuation: Doubles) -> Volume:
         """Its attenuation, 1/mm, from that of its regions."""
         of_voxel = torch.from_numpy(np.append(attenuation, 0.0)).float()[self.owner]
         return self.share.with_data(self.share.data * of_voxel)
+
+
+def _device(
+    name: str, kind: Kind, share: Volume, owner: Tensor, regions: int, touching: Indices | None = None
+) -> _Device:
+    return _Device(name, kind, share, owner, regions, region_voxels(share, owner, regions), touching)
 
 
 def _settled(
@@ -239,7 +255,7 @@ def _views(
             continue
         camera = poses.camera(view, _LEVEL.camera(scene.carm.camera))
         pose = poses.camera_from(device.name)[view]
-        paths = region_paths(device.share, device.owner, device.regions, pose, camera)
+        paths = region_paths(device.voxels, pose, camera)
         covered = torch.from_numpy(paths.sum(1)).reshape(camera.shape) > _LEAST_PATH_MM
         if volume is not None:
             covered = dilated(covered, _AROUND_MM, camera)

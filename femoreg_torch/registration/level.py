@@ -1,5 +1,6 @@
 """How finely a stage looks: pixels of a physical size on the detector, whatever the pixels of the images."""
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -7,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import downsample
+from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import Camera
 
 
@@ -27,12 +28,18 @@ class Level:
         return camera.downsampled(binning(self.pixel_mm, camera))
 
     def image(self, image: Tensor, camera: Camera) -> Tensor:
-        """An image (H, W) of the given camera, averaged to this level."""
-        return downsample(image, binning(self.pixel_mm, camera))
+        """An attenuation image (H, W) of the given camera with the pixels of this level."""
+        return _binned(image, image._version, binning(self.pixel_mm, camera))
 
     def field(self, exposed: Tensor, camera: Camera) -> Tensor:
         """The pixels of this level, bool, that lie wholly in a mask (H, W) of the given camera."""
         return F.max_pool2d((~exposed)[None].float(), binning(self.pixel_mm, camera))[0] == 0
+
+
+@functools.lru_cache(maxsize=24)
+def _binned(image: Tensor, version: int, factor: int) -> Tensor:
+    """`binned`, kept for the stages that follow at the same level; `version` counts changes of the image in place."""
+    return binned(image, factor)
 
 
 def binning(pixel_mm: float, camera: Camera) -> int:

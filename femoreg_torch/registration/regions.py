@@ -1,11 +1,13 @@
 """Regions of a device: blocks of a solid, the paths of rays through them, and the few materials that they are of."""
 
 import math
+from dataclasses import dataclass
 
+import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 from torch import Tensor
 
 from femoreg_torch.geometry import Camera, project_points, transform_points
@@ -55,31 +57,67 @@ def touching_faces(owner: Tensor) -> Indices:
     return np.column_stack([pairs, faces])
 
 
-def region_paths(share: Volume, owner: Tensor, count: int, camera_from_volume: Tensor, camera: Camera) -> csr_array:
-    """Paths in mm (H · W, K) of the rays through K regions of a volume that holds the share of every voxel in it.
+@dataclass(frozen=True, eq=False)
+class RegionVoxels:
+    """The voxels of a device that are not empty, region by region."""
+
+    middles: Tensor  # (n, 3) mm in the device's space
+    volumes: Tensor  # (n,) mm³ that are inside
+    ends: Indices  # (K,): where the voxels of each region end
+
+
+def region_voxels(share: Volume, owner: Tensor, count: int) -> RegionVoxels:
+    """The voxels of K regions of a volume that holds the share of every voxel in it."""
+    where = share.data.nonzero()
+    region = owner[where.unbind(1)].numpy()
+    where = where[torch.from_numpy(np.argsort(region, kind="stable"))]
+    return RegionVoxels(
+        transform_points(share.lps_from_index, where.flip(1).double()),
+        share.data[where.unbind(1)].double() * math.prod(share.spacing_mm),
+        np.cumsum(np.bincount(region, minlength=count)),
+    )
+
+
+def region_paths(voxels: RegionVoxels, camera_from_volume: Tensor, camera: Camera) -> csr_array:
+    """Paths in mm (H · W, K) of the rays through K regions.
 
     Every voxel adds its volume, per area of a pixel's shadow at its depth, to the four pixels around where it is seen.
     """
-    where = share.data.nonzero()
-    points = transform_points(camera_from_volume @ share.lps_from_index, where.flip(1).double())
+    points = transform_points(camera_from_volume, voxels.middles)
     pixels = project_points(camera, points)  # (n, 2) column, row
-    first = pixels.floor()
-    inside = pixels - first
     slant = points[:, 2] / points.norm(dim=1)
     shadow = (points[:, 2] / camera.sdd_mm) ** 2 * camera.pixel_mm[0] * camera.pixel_mm[1] * slant
-    mm = share.data[where.unbind(1)].double() * math.prod(share.spacing_mm) / shadow
-    region = owner[where.unbind(1)]
-    rows, columns, values = [], [], []
-    for right in (0, 1):
-        for below in (0, 1):
-            column, row = first[:, 0] + right, first[:, 1] + below
-            weight = (inside[:, 0] - (1 - right)).abs() * (inside[:, 1] - (1 - below)).abs()
-            seen = (column >= 0) & (row >= 0) & (column < camera.shape[1]) & (row < camera.shape[0])
-            rows.append((row * camera.shape[1] + column)[seen].long())
-            columns.append(region[seen])
-            values.append((mm * weight)[seen])
-    triples = (torch.cat(values).numpy(), (torch.cat(rows).numpy(), torch.cat(columns).numpy()))
-    return csr_array(triples, shape=(camera.shape[0] * camera.shape[1], count))
+    rows, paths, begins = _gathered(pixels.numpy(), (voxels.volumes / shadow).numpy(), voxels.ends, *camera.shape)
+    return csc_array((paths, rows, begins), shape=(camera.shape[0] * camera.shape[1], len(voxels.ends))).tocsr()
+
+
+@numba.njit(cache=True)
+def _gathered(pixels, mm, ends, height, width):  # type: ignore[no-untyped-def]
+    """Pixels and paths of each region in turn, and where each begins, from voxels (n,) region by region."""
+    rows, paths = np.empty(4 * len(mm), np.int32), np.empty(4 * len(mm))
+    begins = np.zeros(len(ends) + 1, np.int32)
+    sums, place = np.zeros(height * width), np.full(height * width, -1)
+    first, n = 0, 0
+    for region in range(len(ends)):
+        begin = n
+        for voxel in range(first, ends[region]):
+            x, y = pixels[voxel]
+            left, top = math.floor(x), math.floor(y)
+            for corner in range(4):
+                column, row = left + (corner & 1), top + (corner >> 1)
+                if 0 <= column < width and 0 <= row < height:
+                    pixel = row * width + column
+                    if place[pixel] < begin:  # not met in this region yet
+                        place[pixel] = n
+                        rows[n] = pixel
+                        n += 1
+                    sums[pixel] += mm[voxel] * (1 - abs(x - column)) * (1 - abs(y - row))
+        for entry in range(begin, n):
+            paths[entry] = sums[rows[entry]]
+            sums[rows[entry]] = 0.0
+        begins[region + 1] = n
+        first = ends[region]
+    return rows[:n], paths[:n], begins
 
 
 def materials(attenuation: Doubles, weights: Indices) -> tuple[Indices, Doubles]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import attenuation_image, downsample
+from femoreg_torch.fluoro import attenuation_image, binned, downsample
 from femoreg_torch.geometry import centred_camera, project_points
 
 
@@ -45,6 +45,25 @@ def test_downsampling_averages_blocks_and_drops_what_fills_none() -> None:
     assert tuple(coarse.shape) == (2, 3, 3, 5)
     torch.testing.assert_close(coarse[1, 2, 2, 4], images[1, 2, 8:12, 16:20].mean())
     torch.testing.assert_close(downsample(images[0, 0], 4), coarse[0, 0])
+
+
+def test_larger_pixels_average_intensities_as_a_detector_does() -> None:
+    counts = 20000 * torch.exp(-5 * torch.rand(24, 32, generator=torch.Generator().manual_seed(1)))
+    fine, coarse = attenuation_image(counts), attenuation_image(downsample(counts, 4))
+    offset = (binned(fine, 4) - coarse).mean()  # of the open beam, smoothed over pixels of another size
+    torch.testing.assert_close(binned(fine, 4), coarse + offset, atol=1e-5, rtol=0)
+    torch.testing.assert_close(binned(binned(fine, 2), 2), binned(fine, 4), atol=1e-5, rtol=0)
+
+
+def test_grey_values_that_are_no_attenuation_are_averaged_themselves() -> None:
+    grey = 255 * torch.rand(64, 64, generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(binned(grey, 4), downsample(grey, 4))
+
+
+def test_a_pixel_without_light_does_not_darken_its_block_for_good() -> None:
+    image = torch.full((64, 64), 1.0)
+    image[5, 5] = 200.0
+    assert binned(image, 4)[1, 1] == pytest.approx(1 - math.log(15 / 16), abs=1e-5)
 
 
 def test_a_blob_stays_where_the_coarser_camera_sees_it() -> None:

@@ -11,7 +11,7 @@ from femoreg_torch.case import Start
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import CArm, Poses, about_point, centred_camera, exp_se3, pose_difference, rigid
 from femoreg_torch.registration.calibration import Calibration, fit_device
-from femoreg_torch.registration.regions import blocks_of, materials, region_paths, touching_faces
+from femoreg_torch.registration.regions import blocks_of, materials, region_paths, region_voxels, touching_faces
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.volume import Volume, axis_aligned, voxelise_mesh
 
@@ -120,7 +120,7 @@ def test_without_images_of_the_device_there_is_nothing_to_do(mixed: Scene) -> No
 def test_paths_through_regions_are_those_of_the_projector() -> None:
     blocks, count = blocks_of(ROD)
     pose = poses().camera_from("device")[1]
-    paths = np.asarray(region_paths(ROD, blocks, count, pose, CARM.camera).sum(1)).reshape(160, 160)
+    paths = np.asarray(region_paths(region_voxels(ROD, blocks, count), pose, CARM.camera).sum(1)).reshape(160, 160)
     exact = project(ROD, pose[None], centred_camera(1000.0, (0.375, 0.375), (640, 640)), 0.1)
     exact = torch.nn.functional.avg_pool2d(exact, 4)[0].numpy()
     assert paths.sum() == pytest.approx(float(exact.sum()), rel=0.01)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from registration_scenes import CARM, REFERENCE_POINTS, float64, make_scene, off, true_poses
 
-from femoreg_torch.fluoro import downsample
+from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import centred_camera
 from femoreg_torch.registration import Level
 from femoreg_torch.registration.level import binning
@@ -30,7 +30,7 @@ def test_images_binned_two_by_two_with_their_camera_are_seen_alike() -> None:
     binned = replace(
         scene,
         carm=replace(CARM, camera=CARM.camera.downsampled(2)),
-        images={kind: tuple(downsample(image, 2) for image in images) for kind, images in scene.images.items()},
+        images={kind: tuple(binned(image, 2) for image in images) for kind, images in scene.images.items()},
     )
     level = Level(pixel_mm=12, step_mm=2)
     camera = level.camera(CARM.camera)
