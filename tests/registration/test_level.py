@@ -27,16 +27,16 @@ def test_the_nearest_whole_factor_by_ratio(pixel_mm: float, pixels: int) -> None
 def test_images_binned_two_by_two_with_their_camera_are_seen_alike() -> None:
     poses = true_poses((0,))
     scene = make_scene(poses)
-    binned = replace(
+    coarser = replace(
         scene,
         carm=replace(CARM, camera=CARM.camera.downsampled(2)),
         images={kind: tuple(binned(image, 2) for image in images) for kind, images in scene.images.items()},
     )
     level = Level(pixel_mm=12, step_mm=2)
     camera = level.camera(CARM.camera)
-    assert camera == level.camera(binned.carm.camera)
+    assert camera == level.camera(coarser.carm.camera)
     assert camera.pixel_mm == (12, 12)
-    finely, coarsely = (level.image(s.images["anatomy"][0], s.carm.camera) for s in (scene, binned))
+    finely, coarsely = (level.image(s.images["anatomy"][0], s.carm.camera) for s in (scene, coarser))
     torch.testing.assert_close(finely, coarsely, atol=1e-6, rtol=1e-5)
     wrong = off(poses.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"], (1, 2, 0), (3, 0, 0))
     body = Body(("pelvis",), 0, float64(0, 0, 740), float64(0.02, 0.02, 0.02, 2, 2, 12))
@@ -45,7 +45,7 @@ def test_images_binned_two_by_two_with_their_camera_are_seen_alike() -> None:
         image_costs(
             s, poses.with_object("pelvis", wrong), (body,), ["pelvis", "femur"], [("anatomy", 0)], level, GradNcc(2)
         )(deltas)
-        for s in (scene, binned)
+        for s in (scene, coarser)
     )
     torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
     assert one.std() > 1e-3
