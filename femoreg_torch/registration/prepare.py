@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,17 +47,20 @@ def prepare_scene(case: Case) -> Scene:
     """Volumes, reference points and images of a case. Raises `InputError` for every input that does not fit."""
     if not case.views:
         raise InputError(f"{case.folder}/case.yaml, views: empty. At least one fluoroscopic image is needed.")
-    images, fields, told = read_images(case)
     from_ct = [thing for thing in case.objects.values() if thing.model is None]
     objects: dict[str, RigidObject] = {}
     tissue = outline = None
-    if from_ct:
-        ct, bones = read_bones(case)
+    with ThreadPoolExecutor(max_workers=1) as beside:  # images are read while the CT is
+        reading = beside.submit(read_images, case)
+        bones = read_bones(case) if from_ct else None
+        images, fields, told = reading.result()
+    if bones is not None:
+        ct, labels = bones
         check_inside(case.landmarks, ct)
-        objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
-        soft = hu_to_attenuation(ct.data.float().clamp_max(SOFT_HU), -1000.0)
-        tissue = resample_isotropic(ct.with_data(soft), TISSUE_SPACING_MM)
-        outline = outline_of(bones, case.anatomy)
+        objects = ct_objects(ct, labels, from_ct, case.anatomy, tuple(images))
+        soft = resample_isotropic(ct.with_data(ct.data.clamp_max(SOFT_HU)), TISSUE_SPACING_MM)
+        tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
+        outline = outline_of(labels, case.anatomy)
     for thing in case.objects.values():
         if thing.model is not None:
             made = model_attenuation(thing.model)

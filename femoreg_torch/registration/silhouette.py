@@ -6,6 +6,7 @@ is the most probable one given PnP's pose with its covariance, and the network's
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -48,8 +49,7 @@ def outline_of(bones: BoneLabels, anatomy: Anatomy | None) -> Outline | None:
     told = tuple(bone for bone in anatomy.outline if bone in bones.ids) if anatomy else ()
     if not told:
         return None
-    ids = torch.tensor(bones.of(told, anatomy), dtype=bones.labels.data.dtype)
-    inside = torch.isin(bones.labels.data, ids).to(torch.float32)
+    inside = torch.from_numpy(np.isin(bones.labels.data.numpy(), bones.of(told, anatomy))).to(torch.float32)
     return Outline(resample_isotropic(bones.labels.with_data(inside), _SPACING_MM), told)
 
 

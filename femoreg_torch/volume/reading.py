@@ -49,8 +49,9 @@ def read_volume(path: Path) -> Volume:
     is not 3-D, is mirrored, or holds values that are not finite.
     """
     image = _read(Path(path))
-    data = torch.from_numpy(sitk.GetArrayViewFromImage(image).astype(np.float32))
-    if not torch.isfinite(data).all():
+    stored = sitk.GetArrayViewFromImage(image)
+    data = torch.from_numpy(stored.astype(np.float32))
+    if stored.dtype.kind == "f" and not torch.isfinite(data).all():
         raise InputError(f"{path}: holds values that are not finite (NaN or infinite). Repair or export it anew.")
     return Volume(data, _lps_from_index(image))
 
