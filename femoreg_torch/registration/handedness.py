@@ -14,7 +14,7 @@ from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, stage_objective
-from femoreg_torch.registration.scene import Body, RigidObject, Scene, reference_point_in_view
+from femoreg_torch.registration.scene import Body, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume
 
@@ -44,19 +44,17 @@ def handedness(scene: Scene, poses: Poses, name: str, imaging: Imaging) -> Hande
         images += scene.there(scene.objects[name].shown_in, (view,))[:1]
     shown = [other for other in poses.camera1_from if all(scene.shown([other], kind) for kind, _ in images)]
 
-    def cost(thing: RigidObject, iterations: bool) -> float:
-        changed = replace(scene, objects=scene.objects | {name: thing})
-        centre = reference_point_in_view(changed, poses, name, 0)
-        body = Body((name,), 0, centre, torch.tensor(_SCALE, dtype=torch.float64))
-        costs = image_costs(changed, poses, (body,), shown, images, _LEVEL, _SIMILARITY, imaging=imaging)
-        if not iterations:
-            return float(costs(costs.still[None]).mean())
-        return _OPTIMISER.minimise(stage_objective(costs, (body,), None), 6, seed=0).value
-
-    thing = scene.objects[name]
-    candidates = [replace(thing, volume=volume) for volume in mirror_images(thing.volume)]
-    nearest = min(candidates, key=lambda candidate: cost(candidate, iterations=False))
-    return Handedness(1 - cost(thing, iterations=False), 1 - cost(nearest, iterations=True))
+    centre = reference_point_in_view(scene, poses, name, 0)
+    body = Body((name,), 0, centre, torch.tensor(_SCALE, dtype=torch.float64))
+    costs = image_costs(scene, poses, (body,), shown, images, _LEVEL, _SIMILARITY, imaging=imaging)
+    as_it_is = float(costs(costs.still[None]).mean())
+    mirrored = [
+        costs.with_object(name, replace(scene.objects[name], volume=volume))
+        for volume in mirror_images(scene.objects[name].volume)
+    ]
+    nearest = min(mirrored, key=lambda candidate: float(candidate(candidate.still[None]).mean()))
+    fitted = _OPTIMISER.minimise(stage_objective(nearest, (body,), None), len(costs.still), seed=0)
+    return Handedness(1 - as_it_is, 1 - fitted.value)
 
 
 def mirror_images(volume: Volume) -> list[Volume]:

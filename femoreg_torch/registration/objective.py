@@ -1,7 +1,7 @@
 """The objective of a stage: mean similarity cost of a batch of candidate deltas (paper, equations 1, 3, 4)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -101,6 +101,14 @@ class ImageCosts:
     def still(self) -> Tensor:
         """The delta (Σ n_b,) that moves nothing."""
         return torch.zeros(sum(len(body.free) for body in self.bodies), dtype=torch.float64)
+
+    def with_object(self, name: str, thing: RigidObject) -> "ImageCosts":
+        """The same images with another object in the place of one that moves."""
+        return replace(self, objects=self.objects | {name: thing})
+
+    def without_what_moves(self) -> Tensor:
+        """Costs (images,) of what stands still alone."""
+        return torch.cat([target.cost(target.background[None]) for target in self.targets])
 
     def quadratics(self, delta: Tensor) -> list[Quadratic]:
         """Each image's cost about one delta (Σ n_b,), with exact gradient and positive semi-definite curvature."""

@@ -215,14 +215,11 @@ def _assess_view(scene: Scene, poses: Poses, name: str, image: tuple[Kind, int],
     body = Body((name,), 0, centre, scale)
     drawn = scene.shown(poses.camera1_from, kind)
     probes = torch.tensor([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]], dtype=torch.float64)
-    costs = image_costs(scene, local, (body,), drawn, [image], _LEVEL, _SIMILARITY, imaging=imaging)(probes)[
-        :, 0
-    ].tolist()
-    others = [n for n in drawn if n != name]
-    nothing = torch.zeros(1, 0, dtype=torch.float64)
-    without = image_costs(scene, local, (), others, [image], _LEVEL, _SIMILARITY, imaging=imaging)(nothing)
+    drawing = image_costs(scene, local, (body,), drawn, [image], _LEVEL, _SIMILARITY, imaging=imaging)
+    costs = drawing(probes)[:, 0].tolist()
+    without = float(drawing.without_what_moves()[0])
     pull = (_minimum(costs[1], costs[0], costs[2]) * _PROBE_MM, _minimum(costs[3], costs[0], costs[4]) * _PROBE_MM)
-    return ViewQuality(view + 1, 1 - costs[0], float(without[0, 0]) - costs[0], pull)
+    return ViewQuality(view + 1, 1 - costs[0], without - costs[0], pull)
 
 
 def _minimum(before: float, here: float, after: float) -> float:
