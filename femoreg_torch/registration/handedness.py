@@ -50,7 +50,7 @@ def handedness(scene: Scene, poses: Poses, name: str, imaging: Imaging) -> Hande
     as_it_is = float(costs(costs.still[None]).mean())
     mirrored = [
         costs.with_object(name, replace(scene.objects[name], volume=volume))
-        for volume in mirror_images(scene.objects[name].volume)
+        for volume in mirror_images(_LEVEL.volume(scene.objects[name].volume))
     ]
     nearest = min(mirrored, key=lambda candidate: float(candidate(candidate.still[None]).mean()))
     fitted = _OPTIMISER.minimise(stage_objective(nearest, (body,), None), len(costs.still), seed=0)

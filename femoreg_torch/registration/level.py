@@ -1,8 +1,9 @@
-"""How finely a stage looks: pixels of a physical size on the detector, whatever the pixels of the images."""
+"""How finely a stage looks: pixels of a physical size on the detector, whatever those of the images, and voxels to fit."""
 
 import functools
 import math
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 from torch import Tensor
 from torch.nn import functional as F
@@ -10,6 +11,11 @@ from torch.nn import functional as F
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import Camera
+from femoreg_torch.volume import Volume, halved
+
+
+_ROUNDING_MM = 1e-6
+_halves: WeakKeyDictionary[Volume, Volume] = WeakKeyDictionary()  # volumes on voxels twice as large, for later stages
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,14 @@ class Level:
     def image(self, image: Tensor, camera: Camera) -> Tensor:
         """An attenuation image (H, W) of the given camera with the pixels of this level."""
         return _binned(image, image._version, binning(self.pixel_mm, camera))
+
+    def volume(self, volume: Volume) -> Volume:
+        """A volume with voxels as large as the steps of this level allow: its own, or twice, four times … as large."""
+        if 2 * max(volume.spacing_mm) > self.step_mm + _ROUNDING_MM:
+            return volume
+        if volume not in _halves:
+            _halves[volume] = halved(volume)
+        return self.volume(_halves[volume])
 
     def field(self, exposed: Tensor, camera: Camera) -> Tensor:
         """The pixels of this level, bool, that lie wholly in a mask (H, W) of the given camera."""

@@ -9,7 +9,7 @@ from femoreg_torch.volume.landmarks import check_inside, read_landmarks, write_l
 from femoreg_torch.volume.mesh import check_closed, voxelise_mesh
 from femoreg_torch.volume.mesh_files import bounds_of, read_bodies, read_mesh
 from femoreg_torch.volume.reading import read_ct, read_label_map, read_labels, read_volume, write_volume
-from femoreg_torch.volume.resample import crop, resample_isotropic
+from femoreg_torch.volume.resample import crop, halved, resample_isotropic
 from femoreg_torch.volume.segments import segment_names
 from femoreg_torch.volume.solids import Solid, solid_volumes
 
@@ -23,6 +23,7 @@ __all__ = [
     "check_closed",
     "check_inside",
     "crop",
+    "halved",
     "hu_to_attenuation",
     "label_box_centre",
     "label_share",

@@ -58,3 +58,12 @@ def resample_isotropic(volume: Volume, spacing_mm: float, nearest: bool = False)
     affine[:3, 3] += affine[:3, :3] @ (0.5 * ratio - 0.5)
     affine[:3, :3] *= ratio
     return Volume(_resize(volume.data, (scale[0], scale[1], scale[2]), nearest), affine)
+
+
+def halved(volume: Volume) -> Volume:
+    """The volume on voxels twice as large, each the mean of eight; what is missing at the far faces counts as zero."""
+    data = F.pad(volume.data, [n for size in reversed(volume.data.shape) for n in (0, size % 2)])
+    affine = volume.lps_from_index.clone()
+    affine[:3, 3] += affine[:3, :3].sum(1) / 2
+    affine[:3, :3] *= 2
+    return Volume(F.avg_pool3d(data[None].float(), 2)[0], affine)
