@@ -1,9 +1,14 @@
 """Fiducial-free 2D/3D registration of femur and drilling device for robot-assisted femoroplasty."""
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+# Threads that wait actively for one another make everything ten times slower where others use the machine too. OpenMP
+# asks for this once, when torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 if TYPE_CHECKING:
     from femoreg_torch.anatomy import Anatomy as Anatomy

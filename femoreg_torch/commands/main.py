@@ -7,7 +7,6 @@ positional (a `list[…]` takes one or more values), all others are options. Onl
 
 import ast
 import inspect
-import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib.machinery import PathFinder
@@ -30,8 +29,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     0: done; 1: `doctor` found something amiss; 2: bad input, told in one line on stderr; 3: done, but not trusted;
     130: interrupted. Whatever else goes wrong is a defect of this program and keeps its traceback.
     """
-    # Threads that wait actively for one another cost ten times the processor time where others use the machine too.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands = {command.name: command for command in entry_points(group=GROUP)}
     try:

@@ -6,6 +6,7 @@ A transform is named after what it does: `camera_from_object` takes points of th
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -88,7 +89,8 @@ def rigid(rotation: Tensor | None = None, translation: Tensor | None = None) -> 
         )
     if translation is None:
         translation = rotation.new_zeros(rotation.shape[:-1])
-    shape = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    # torch's own function imports its tracer of shapes, for a third of a second
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     top = torch.cat([rotation.expand(*shape, 3, 3), translation.expand(*shape, 3)[..., None]], -1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*shape, 1, 4)
     return torch.cat([top, bottom], -2)

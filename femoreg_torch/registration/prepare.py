@@ -50,28 +50,32 @@ def prepare_scene(case: Case) -> Scene:
     from_ct = [thing for thing in case.objects.values() if thing.model is None]
     objects: dict[str, RigidObject] = {}
     tissue = outline = None
-    with ThreadPoolExecutor(max_workers=1) as beside:  # images are read while the CT is
+    with ThreadPoolExecutor(max_workers=1) as beside:  # images and models are read while the CT is
         reading = beside.submit(read_images, case)
-        bones = read_bones(case) if from_ct else None
+        making = {
+            thing.name: beside.submit(model_attenuation, thing.model) for thing in case.objects.values() if thing.model
+        }
+        if from_ct:
+            ct, bones = read_bones(case)
+            check_inside(case.landmarks, ct)
+            soft = resample_isotropic(ct.with_data(ct.data.clamp_max(SOFT_HU)), TISSUE_SPACING_MM)
+            tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
+            outline = outline_of(bones, case.anatomy)
         images, fields, told = reading.result()
-    if bones is not None:
-        ct, labels = bones
-        check_inside(case.landmarks, ct)
-        objects = ct_objects(ct, labels, from_ct, case.anatomy, tuple(images))
-        soft = resample_isotropic(ct.with_data(ct.data.clamp_max(SOFT_HU)), TISSUE_SPACING_MM)
-        tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
-        outline = outline_of(labels, case.anatomy)
-    for thing in case.objects.values():
-        if thing.model is not None:
-            made = model_attenuation(thing.model)
-            objects[thing.name] = RigidObject(
-                made.volume,
-                made.volume.centre() if thing.reference is None else thing.reference,
-                thing.images or tuple(images),
-                thing.start,
-                parts=made.parts,
-                materials_known=thing.model.materials_known,
-            )
+        if from_ct:
+            objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
+        made = {name: model.result() for name, model in making.items()}
+    for name, volumes in made.items():
+        thing = case.objects[name]
+        assert thing.model is not None
+        objects[name] = RigidObject(
+            volumes.volume,
+            volumes.volume.centre() if thing.reference is None else thing.reference,
+            thing.images or tuple(images),
+            thing.start,
+            parts=volumes.parts,
+            materials_known=thing.model.materials_known,
+        )
     known = case.views[-1].camera_from_camera1 is not None
     identity = torch.eye(4, dtype=torch.float64)
     cameras = [identity if v.camera_from_camera1 is None else v.camera_from_camera1 for v in case.views]

@@ -49,7 +49,9 @@ def outline_of(bones: BoneLabels, anatomy: Anatomy | None) -> Outline | None:
     told = tuple(bone for bone in anatomy.outline if bone in bones.ids) if anatomy else ()
     if not told:
         return None
-    inside = torch.from_numpy(np.isin(bones.labels.data.numpy(), bones.of(told, anatomy))).to(torch.float32)
+    wanted = np.zeros(256, np.float32)
+    wanted[list(bones.of(told, anatomy))] = 1
+    inside = torch.from_numpy(wanted[bones.labels.data.numpy()])
     return Outline(resample_isotropic(bones.labels.with_data(inside), _SPACING_MM), told)
 
 

@@ -1,6 +1,7 @@
 """Where the structures of a label map are."""
 
 from collections.abc import Sequence
+from weakref import WeakKeyDictionary
 
 import torch
 from scipy import ndimage
@@ -11,6 +12,7 @@ from femoreg_torch.geometry import transform_points
 from femoreg_torch.volume.grid import Volume
 
 Corner = tuple[int, int, int]  # x, y, z
+_boxes: WeakKeyDictionary[Volume, list[tuple[slice, slice, slice] | None]] = WeakKeyDictionary()  # of a map's labels
 
 
 def label_box(labels: Volume, ids: Sequence[int]) -> tuple[Corner, Corner]:
@@ -18,7 +20,9 @@ def label_box(labels: Volume, ids: Sequence[int]) -> tuple[Corner, Corner]:
 
     Raises `InputError` if none of the ids occurs.
     """
-    boxes = ndimage.find_objects(labels.data.numpy())
+    if labels not in _boxes:
+        _boxes[labels] = ndimage.find_objects(labels.data.numpy())
+    boxes = _boxes[labels]
     found = [boxes[n - 1] for n in ids if n <= len(boxes) and boxes[n - 1] is not None]
     if not found:
         raise InputError(f"label map: no voxel carries any of the labels {list(ids)}. Check `structures` against it.")

@@ -78,7 +78,8 @@ def read_label_map(path: Path) -> Volume:
     """
     image = _read(Path(path))
     data = sitk.GetArrayViewFromImage(image)
-    if not (data.min() >= 0 and data.max() <= LARGEST_ID and (data == np.floor(data)).all()):
+    whole = data.dtype.kind in "iu" or (data == np.floor(data)).all()
+    if not (data.min() >= 0 and data.max() <= LARGEST_ID and whole):
         raise InputError(
             f"{path}: a label map of whole numbers from 0 to {LARGEST_ID} was expected, found {data.min():g} to "
             f"{data.max():g}. Export the segmentation as a label map."
