@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 # Threads that wait actively for one another make everything ten times slower where others use the machine too. OpenMP
-# asks for this once, when torch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# asks for this once, when torch is imported: how often its threads look before they sleep.
+if "OMP_WAIT_POLICY" not in os.environ:
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 if TYPE_CHECKING:
     from femoreg_torch.anatomy import Anatomy as Anatomy
