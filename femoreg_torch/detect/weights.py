@@ -39,7 +39,7 @@ def load_network(path: Path | None = None) -> LandmarkNetwork:
     except (OSError, ValueError) as error:
         raise InputError(str(error)) from error
     try:
-        anatomy = load_anatomy(weights.anatomy)
+        anatomy = HIP if weights.anatomy == HIP.name else load_anatomy(weights.anatomy)
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
     settings = read_record(find(NETWORKS_GROUP, weights.kind, NETWORKS, where), weights.settings, where)

@@ -16,6 +16,7 @@ from femoreg_torch.geometry.rigid import (
     rigid,
     rotation_angle,
     transform_points,
+    twist_rates,
 )
 
 __all__ = [
@@ -43,4 +44,5 @@ __all__ = [
     "rigid",
     "rotation_angle",
     "transform_points",
+    "twist_rates",
 ]

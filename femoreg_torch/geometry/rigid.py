@@ -138,6 +138,14 @@ def about_point(transform: Tensor, centre: Tensor) -> Tensor:
     return rigid(rotation, shift + centre - moved)
 
 
+def twist_rates(changes: Tensor, pose: Tensor, centre: Tensor) -> Tensor:
+    """Twists (6, n) about `centre` (3,), mm in the camera frame, that belong to changes (n, 4, 4) of a pose (4, 4)."""
+    velocity = changes @ invert_rigid(pose)  # (n, 4, 4): of points in the camera frame
+    spin = velocity[:, :3, :3]
+    rotation = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]])
+    return torch.cat([rotation, (spin @ centre + velocity[:, :3, 3]).T])
+
+
 def rotation_angle(rotation: Tensor) -> Tensor:
     """Axis angle (...) in radians, in [0, π], of rotation matrices (..., 3, 3)."""
     q = _quaternion(rotation)

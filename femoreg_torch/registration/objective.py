@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.drr import project, project_with_jacobian
-from femoreg_torch.geometry import Camera, Poses, invert_rigid, transform_points
+from femoreg_torch.geometry import Camera, Poses, transform_points, twist_rates
 from femoreg_torch.optimize import Quadratic, SmoothObjective
 from femoreg_torch.registration.imaging import PLAIN, Imaging, tissue_integrals
 from femoreg_torch.registration.intrinsics import PRIOR_WEIGHT, Intrinsics
@@ -204,7 +204,7 @@ class ImageCosts:
             drawn = drawn + image[0]
             planes = jacobian[0].movedim(-1, 0)
             jacobians.append(planes[:6])
-            twists.append(_twists(change, pose, centre))
+            twists.append(twist_rates(change, pose, centre))
             for intrinsics, _ in refining:
                 sliding = intrinsics.slide_rates(target.view, camera.sdd_mm).to(jacobian.dtype)
                 by_rays = by_rays + planes[6:] + torch.tensordot(sliding, planes[3:6], 1)
@@ -216,14 +216,6 @@ class ImageCosts:
         cost, scores, hessian = similarity_quadratic(target.similarity, target.seen(drawn), changes.movedim(0, -1))
         by_delta = torch.cat(twists)  # (6 O, or 6 O + 3, n)
         return Quadratic(cost, scores @ by_delta, by_delta.T @ hessian @ by_delta)
-
-
-def _twists(changes: Tensor, pose: Tensor, centre: Tensor) -> Tensor:
-    """Twists (6, n) about `centre` (3,) in the camera frame that belong to changes (n, 4, 4) of a pose (4, 4)."""
-    velocity = changes @ invert_rigid(pose)  # (n, 4, 4): of points in the camera frame
-    spin = velocity[:, :3, :3]
-    rotation = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]])
-    return torch.cat([rotation, (spin @ centre + velocity[:, :3, 3]).T])
 
 
 def image_costs(

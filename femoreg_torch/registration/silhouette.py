@@ -13,8 +13,8 @@ from torch.nn import functional as F
 
 from femoreg_torch.anatomy import Anatomy
 from femoreg_torch.detect import to_network_grid
-from femoreg_torch.drr import project
-from femoreg_torch.geometry import Camera, about_point, exp_se3
+from femoreg_torch.drr import project, project_with_jacobian
+from femoreg_torch.geometry import Camera, about_point, exp_se3, twist_rates
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective
 from femoreg_torch.registration.scene import Outline, Segmentation
 from femoreg_torch.registration.weights import dilated
@@ -27,7 +27,7 @@ _OPAQUE_MM = 2.0  # path in bone after which a pixel is labelled with probabilit
 _PIXEL_DEVIATION = 1.0
 _BAND_MM = 15.0  # on the detector, about the bone that is seen; further off a shutter may hide what is drawn
 _HIDDEN_MARGIN_MM = 3.0
-_STEP = 1e-3  # of a twist in standard deviations, for derivatives
+_STEP = 1e-5  # of a twist in standard deviations, for derivatives of the pose
 _SEARCH = LevenbergMarquardt(max_iterations=15, tol_x=0.02, tol_f=0.01, candidates=60, starts=3)
 
 
@@ -79,9 +79,11 @@ def refine_by_silhouette(
     def poses(units: Tensor) -> Tensor:
         return about_point(exp_se3(units @ root.T), centre) @ camera_from_ct
 
+    def seen_of(lengths: Tensor) -> Tensor:
+        return 1 - torch.exp(-lengths[..., looked_at].double() / _OPAQUE_MM)
+
     def drawn(units: Tensor) -> Tensor:
-        lengths = project([outline.mask], poses(units)[:, None], seen.camera, _SPACING_MM)
-        return 1 - torch.exp(-lengths[:, looked_at].double() / _OPAQUE_MM)
+        return seen_of(project([outline.mask], poses(units)[:, None], seen.camera, _SPACING_MM))
 
     def values(units: Tensor) -> Tensor:
         misfit = (drawn(units) - target).square().sum(1) / _PIXEL_DEVIATION**2
@@ -89,9 +91,13 @@ def refine_by_silhouette(
 
     def quadratic(unit: Tensor) -> Quadratic:
         steps = _STEP * torch.eye(6, dtype=torch.float64)
-        here, above, below = drawn(torch.cat([unit[None], unit + steps, unit - steps])).split([1, 6, 6])
-        slopes = (above - below) / (2 * _STEP * _PIXEL_DEVIATION)
-        misfit = (here[0] - target) / _PIXEL_DEVIATION
+        pose, above, below = poses(torch.cat([unit[None], unit + steps, unit - steps])).split([1, 6, 6])
+        twists = twist_rates((above - below) / (2 * _STEP), pose[0], centre)
+        lengths, jacobian = project_with_jacobian(outline.mask, pose, seen.camera, centre, _SPACING_MM)
+        here = seen_of(lengths[0])
+        by_unit = twists.T @ jacobian[0, looked_at].double().T  # (6, pixels)
+        slopes = by_unit * (1 - here) / (_OPAQUE_MM * _PIXEL_DEVIATION)
+        misfit = (here - target) / _PIXEL_DEVIATION
         value = 0.5 * float(misfit @ misfit + unit @ unit)
         return Quadratic(value, (slopes @ misfit + unit)[None], slopes @ slopes.T + torch.eye(6, dtype=torch.float64))
 

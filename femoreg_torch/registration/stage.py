@@ -1,5 +1,6 @@
 """A stage: one optimisation of bodies over images, or one for each other view."""
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -243,7 +244,9 @@ def _costs(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], bod
 
 
 def _doubt(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...]) -> float:
-    """By how many standard deviations the stage's images doubt the C-arm's file."""
+    """By how many standard deviations the stage's images doubt the C-arm's file; 0 where it need not be asked."""
+    if stage.doubt == math.inf:
+        return 0.0
     bodies = stage.moving(scene, poses, views)
     refined = next((body for body in bodies if isinstance(body, Intrinsics)), None)
     if refined is None:
