@@ -25,7 +25,7 @@ def read_record(kind: type[_T], content: dict[str, Any], where: str, ready: Mapp
         if key not in known:
             raise InputError(f"{where}: unknown key {str(key)[:60]!r}. Known keys: {', '.join(known)}.")
     ready = ready or {}
-    parser = _parser(kind, frozenset(ready))
+    parser = _parser(kind, frozenset(ready))  # type: ignore[arg-type]  # a class can be hashed
     try:
         return kind(**vars(parser.instantiate(parser.parse_object(content))), **ready)
     except (ArgumentError, TypeError, InputError) as error:

@@ -104,10 +104,10 @@ def _with_derivatives(
     """
     if volume.data.device.type == "cpu":
         numbers = affines.numpy(), camera, offsets.numpy(), step_mm
-        image, moments = cpu.projection_with_moments(bricked(volume), *numbers)
+        integrals, moments = cpu.projection_with_moments(bricked(volume), *numbers)
         slides = rates[:, :, None, None] * affines[:, None, :, :3]
         planes = cpu.jacobian(moments, camera, changes.numpy(), slides.numpy())
-        return torch.from_numpy(image), torch.from_numpy(planes)
+        return torch.from_numpy(integrals), torch.from_numpy(planes)
     if reason := cuda.why_not(volume):
         raise InputError(f"project_with_jacobian: {reason}. Move the volume to the CPU, or use Triton on CUDA.")
     image, derivatives = cuda.jacobian(volume, affines, changes, camera, offsets, step_mm)

@@ -1,4 +1,4 @@
-"""How finely a stage looks: pixels of a physical size on the detector, whatever those of the images, and voxels to fit."""
+"""How finely a stage looks: pixels of a physical size on the detector, whatever the images' own, and voxels to fit."""
 
 import functools
 import math
@@ -12,7 +12,6 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import Camera
 from femoreg_torch.volume import Volume, halved
-
 
 _ROUNDING_MM = 1e-6
 _halves: WeakKeyDictionary[Volume, Volume] = WeakKeyDictionary()  # volumes on voxels twice as large, for later stages

@@ -46,10 +46,10 @@ class BodyPlan:
     reference point it turns about: by default its own, that of the first if several are named, and for [all], [view]
     and [views] that of the scene's anchor. Objects that no image of the case shows are passed over, and a body stays
     where it is in a stage whose images show nothing of it.
-    [intrinsics] are the cameras themselves: the source distance of all views
-    and the principal point of each, as far as the C-arm's file is uncertain of them. With `doubt` they
-    move only where they were refined before, or where the images, all else settled, doubt them by so many standard
-    deviations: images that are drawn a little wrong feign a little other intrinsics, and a C-arm's file may be right.
+    [intrinsics] are the cameras themselves: the source distance of all views and the principal point of each, as far as
+    the C-arm's file is uncertain of them. With `doubt` they move only where they were refined before, or where the
+    images, all else settled, doubt them by so many standard deviations (infinite: they are not asked): images that are
+    drawn a little wrong feign a little other intrinsics, and a C-arm's file may be right.
     """
 
     move: list[str]

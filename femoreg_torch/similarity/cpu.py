@@ -234,7 +234,10 @@ def _box(image):  # type: ignore[no-untyped-def]
 
 @_jit
 def _patch_sums(one, other, side, stride, patches, plain, product):  # type: ignore[no-untyped-def]
-    """Sums of `one` and of `one` · `other` over every stride-th patch, of `patches`: first and last + 1 row and column."""
+    """Sums of `one` and of `one` · `other` over every stride-th patch.
+
+    `patches` are their first and last + 1 row, then column.
+    """
     first, last, low, high = patches
     left, right = low * stride, (high - 1) * stride + side
     column, column_product = np.empty(right - left, np.float32), np.empty(right - left, np.float32)
@@ -338,9 +341,7 @@ def curvature_factors(  # type: ignore[no-untyped-def]
     mean, of_mean, of_along = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
     _gradients(image, average, slope, moving)
     for d in nb.prange(2):
-        _shares(
-            moving[d], fixed[d], scale[d], weights, side, stride, floor, mean[d], of_mean[d], of_along[d], root[d]
-        )
+        _shares(moving[d], fixed[d], scale[d], weights, side, stride, floor, mean[d], of_mean[d], of_along[d], root[d])
     maps = np.empty((count, 2, height, width), np.float32)
     total, along = np.empty((count, 2, rows, columns), np.float32), np.empty((count, 2, rows, columns), np.float32)
     for c in nb.prange(count):

@@ -23,7 +23,7 @@ def label_box(labels: Volume, ids: Sequence[int]) -> tuple[Corner, Corner]:
     if labels not in _boxes:
         _boxes[labels] = ndimage.find_objects(labels.data.numpy())
     boxes = _boxes[labels]
-    found = [boxes[n - 1] for n in ids if n <= len(boxes) and boxes[n - 1] is not None]
+    found = [box for n in ids if n <= len(boxes) and (box := boxes[n - 1]) is not None]
     if not found:
         raise InputError(f"label map: no voxel carries any of the labels {list(ids)}. Check `structures` against it.")
     x, y, z = ((min(box[axis].start for box in found), max(box[axis].stop for box in found)) for axis in (2, 1, 0))

@@ -24,6 +24,7 @@ from femoreg_torch.geometry import (
     rigid,
     rotation_angle,
     transform_points,
+    twist_rates,
 )
 
 AXES = [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.6, 0.0, -0.8), (-1 / 3, 2 / 3, 2 / 3)]
@@ -116,6 +117,16 @@ def test_exp_se3_agrees_with_the_matrix_exponential():
         algebra[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
         algebra[:3, 3] = twist[3:]
         assert_close(exp_se3(twist), torch.linalg.matrix_exp(algebra), atol=1e-11, rtol=1e-12)
+
+
+def test_twist_rates_are_those_of_the_twist_that_moves_a_pose():
+    generator = torch.Generator().manual_seed(3)
+    twist, pose = torch.randn(2, 6, generator=generator).double()
+    pose, centre = exp_se3(pose), torch.tensor([3.0, -50.0, 700.0], dtype=torch.float64)
+    step = 1e-6
+    moved = [about_point(exp_se3(sign * step * twist), centre) @ pose for sign in (1, -1)]
+    rates = twist_rates(((moved[0] - moved[1]) / (2 * step))[None], pose, centre)
+    assert_close(rates[:, 0], twist, atol=1e-6, rtol=1e-6)
 
 
 # Round trips and derivatives -----------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from torch import Tensor
 from femoreg_torch.case import Case, CaseObject, Model, Part, Start, View
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import CArm, centred_camera
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, run_plan
@@ -75,7 +76,7 @@ def test_a_labelled_volume_registers_as_the_mesh(tmp_path: Path) -> None:
     for view in range(3):
         where = torch.stack([placed.camera_from(name)[view] for name in ("pelvis", "device")])[None]
         image = project([VOLUMES["pelvis"], fine], where, camera, 0.25)
-        images.append(torch.nn.functional.avg_pool2d(image[None], 2)[0, 0])
+        images.append(binned(image[0], 2))
     start = placed.with_object("device", off(true, CENTRE, (3, -2, 2), (3, -2, 4)))
     stage = Stage(
         "device",

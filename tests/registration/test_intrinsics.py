@@ -123,6 +123,16 @@ def test_a_file_that_is_not_doubted_changes_nothing(scene: Scene) -> None:
     assert torch.equal(waiting.poses.camera_from_camera1, without.poses.camera_from_camera1)
 
 
+def test_a_stage_that_does_not_ask_refines_what_was_refined_before(scene: Scene) -> None:
+    wrong, start = _wrong(scene, 1.04), _slid(scene, 1.04)
+    silent = _stage(doubt=math.inf, iterations=1)
+    assert run_stage(wrong, start, silent, (0, 1, 2), 0).poses.changes == ()
+    begun = start.with_changes((CameraChange(1 / 1.02),) * 3)
+    after = run_stage(wrong, begun, silent, (0, 1, 2), 0).poses.changes
+    assert after
+    assert after[0].sdd_factor != begun.changes[0].sdd_factor
+
+
 def test_a_stage_that_goes_on_with_free_intrinsics_counts_both_parts(scene: Scene) -> None:
     wrong, start = _wrong(scene, 1.04), _slid(scene, 1.04)
     record = run_stage(wrong, start, _stage(doubt=2.5, iterations=1), (0, 1, 2), 0)

@@ -13,6 +13,7 @@ from femoreg_torch.registration.level import binning
 from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.scene import Body
 from femoreg_torch.similarity import GradNcc
+from femoreg_torch.volume import Volume, axis_aligned
 
 
 @pytest.mark.parametrize(
@@ -49,3 +50,21 @@ def test_images_binned_two_by_two_with_their_camera_are_seen_alike() -> None:
     )
     torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
     assert one.std() > 1e-3
+
+
+def test_voxels_are_as_large_as_the_steps_allow() -> None:
+    volume = Volume(torch.rand(8, 8, 8), axis_aligned((1.0, 1.0, 0.5), (0.0, 0.0, 0.0)))
+    assert Level(3.0, 1.9).volume(volume) is volume
+    twice = Level(3.0, 2.0).volume(volume)
+    assert twice.spacing_mm == pytest.approx((2.0, 2.0, 1.0))
+    assert Level(6.0, 3.0).volume(volume) is twice  # made once
+    assert Level(6.0, 4.0).volume(volume).spacing_mm == pytest.approx((4.0, 4.0, 2.0))
+
+
+def test_an_image_that_changes_in_place_is_averaged_anew() -> None:
+    level, image = Level(2.0, 1.0), torch.ones(8, 8)
+    camera = centred_camera(1000.0, (1.0, 1.0), (8, 8))
+    before = level.image(image, camera)
+    assert level.image(image, camera) is before
+    image += 1
+    torch.testing.assert_close(level.image(image, camera), before + 1)

@@ -10,6 +10,7 @@ from torch import Tensor
 from femoreg_torch.errors import InputError
 from femoreg_torch.similarity import GradientOrientation, GradNcc, Ncc, Similarity, similarity_quadratic
 from femoreg_torch.similarity.kernels import image_gradients
+from femoreg_torch.similarity.quadratic import tile_scores
 
 _RADIUS = 4
 
@@ -116,6 +117,27 @@ def test_curvature_equals_a_literal_sum_over_patches() -> None:
     torch.testing.assert_close(found, literal / patches, rtol=1e-3, atol=1e-6)
     coarse = similarity.quadratic(moving, jacobian)[2]
     assert (coarse - found).norm() < 0.1 * found.norm()
+
+
+def test_compiled_and_plain_torch_agree_in_curvature_and_scores() -> None:
+    """Changes that are nowhere, somewhere within, and up to the border; weights that leave part of the image out."""
+    fixed, moving = picture(0, 60, 53), picture(0, 60, 53) + 0.3 * picture(1, 60, 53)
+    changes = torch.stack([picture(n, 60, 53) for n in range(2, 8)])
+    changes[1] = 0
+    changes[2, :20], changes[2, 45:], changes[2, :, :17], changes[2, :, 30:] = 0, 0, 0, 0
+    changes[3, 5:], changes[4, :, :50] = 0, 0
+    weights = torch.ones(60, 53)
+    weights[:, 35:] = 0
+    compiled = GradNcc(_RADIUS).against(fixed, weights)
+    found = compiled.curvature(moving, changes, stride=4)
+    assert found.abs().max() > 1e-3
+    torch.testing.assert_close(
+        found, compiled.curvature(moving.double(), changes.double(), stride=4), rtol=1e-4, atol=1e-7
+    )
+    slope = picture(9, 60, 53)[None] - 0.5
+    plain = tile_scores(changes.double(), slope.double(), 22)
+    torch.testing.assert_close(tile_scores(changes, slope, 22), plain, rtol=1e-4, atol=1e-5)
+    assert plain.shape == (9, 6)
 
 
 def test_flat_images_have_no_curvature() -> None:

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.volume import Volume, axis_aligned, crop, resample_isotropic
+from femoreg_torch.volume import Volume, axis_aligned, crop, halved, resample_isotropic
 
 GRADIENT = torch.tensor([1.5, -0.7, 0.4], dtype=torch.float64)  # HU per mm of L, P, S
 
@@ -69,6 +69,19 @@ def test_labels_stay_labels_each_that_of_the_nearest_voxel(dtype: torch.dtype, l
     homogeneous = torch.cat([positions(new), torch.ones(*new.data.shape, 1)], -1).double()
     x, y, z = (homogeneous @ torch.linalg.inv(labels.lps_from_index).T)[..., :3].round().long().clamp(0, 9).unbind(-1)
     assert torch.equal(new.data, labels.data[z, y, x])
+
+
+def test_halved_volumes_keep_sums_and_places() -> None:
+    generator = torch.Generator().manual_seed(0)
+    volume = Volume(torch.rand(7, 10, 9, generator=generator), axis_aligned((1.0, 1.5, 2.0), (3.0, -4.0, 5.0)))
+    half = halved(volume)
+    assert half.data.shape == (4, 5, 5)
+    assert half.spacing_mm == pytest.approx((2.0, 3.0, 4.0))
+    torch.testing.assert_close(8 * half.data.sum(), volume.data.sum())
+    torch.testing.assert_close(half.data[1, 2, 3], volume.data[2:4, 4:6, 6:8].mean())
+    middle = half.lps_from_index @ torch.tensor([3.0, 2.0, 1.0, 1.0], dtype=torch.float64)
+    eight = volume.lps_from_index @ torch.tensor([6.5, 4.5, 2.5, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(middle, eight)
 
 
 def test_voxels_larger_than_the_volume_are_refused() -> None:

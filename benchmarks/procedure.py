@@ -1,0 +1,97 @@
+"""Where the time of `femoreg register` goes: imports, reading, detection, each stage, quality, writing.
+
+    python benchmarks/procedure.py CASE [--runs 5] [--cores 2 1]
+
+Every run is the command in a process of its own. The table holds the median of each row.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+from measure import machine, table, write_section
+
+_COMMAND = "import sys; from femoreg_torch.commands.main import main; sys.exit(main())"
+_IMPORTS = "import femoreg_torch.commands.register, femoreg_torch.registration.run, femoreg_torch.evaluation"
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+Seconds = dict[str, float]
+
+
+def environment(cores: int) -> dict[str, str]:
+    """That of this process, with so many threads."""
+    return os.environ | dict.fromkeys(_THREADS, str(cores))
+
+
+def timed(arguments: list[str], cores: int) -> tuple[float, float]:
+    """Seconds of a process on the first `cores` cores, and the most memory it held, MiB."""
+    available = sorted(os.sched_getaffinity(0))[:cores]
+    began = time.perf_counter()
+    process = subprocess.Popen(
+        arguments,
+        env=environment(cores),
+        stdout=subprocess.DEVNULL,
+        preexec_fn=lambda: os.sched_setaffinity(0, available),
+    )
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        raise SystemExit(f"{' '.join(arguments[-4:])}: ended with status {os.waitstatus_to_exitcode(status)}.")
+    return time.perf_counter() - began, used.ru_maxrss / 1024
+
+
+def one_run(case: Path, cores: int) -> tuple[Seconds, dict[str, int], float]:
+    """Seconds by part of one run of the command, evaluations by stage, and the most memory, MiB."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        whole, peak = timed([sys.executable, "-c", _COMMAND, "register", str(case), "--out", str(out)], cores)
+        result = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    imports, _ = timed([sys.executable, "-c", _IMPORTS], cores)
+    told = result["timings_s"]
+    parts = {"start of Python and imports": imports, "reading": told["reading"], "detection": told["detection"]}
+    evaluations = {}
+    for stage in result["stages"]:
+        name = f"stage: {stage['name']}"
+        parts[name] = parts.get(name, 0.0) + stage["seconds"]
+        evaluations[name] = evaluations.get(name, 0) + stage["evaluations"]
+    parts["between stages"] = told["registration"] - sum(stage["seconds"] for stage in result["stages"])
+    parts["quality"] = told["quality"]
+    parts["the case's files, writing, end"] = whole - imports - told["total"]
+    return parts | {"**whole command**": whole}, evaluations, peak
+
+
+def main() -> None:
+    """Measure and write the section of RESULTS.md."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("case", type=Path, help="case folder")
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--cores", type=int, nargs="+", default=[2, 1])
+    settings = parser.parse_args()
+    columns: list[Seconds] = []
+    evaluations: dict[str, int] = {}
+    peaks = []
+    for cores in settings.cores:
+        one_run(settings.case, cores)  # fills the caches of compiled code and of the file system
+        runs = [one_run(settings.case, cores) for _ in range(settings.runs)]
+        columns.append({part: median(run[0][part] for run in runs) for part in runs[0][0]})
+        evaluations = runs[0][1]
+        peaks.append(max(run[2] for run in runs))
+    rows = [
+        [part, str(evaluations.get(part, "")), *(f"{column[part]:.2f}" for column in columns)] for part in columns[0]
+    ]
+    rows.append(["most memory, MiB", "", *(f"{peak:.0f}" for peak in peaks)])
+    header = ["part", "evaluations", *(f"{cores} core{'s' * (cores > 1)}: s" for cores in settings.cores)]
+    text = (
+        f"{machine('cpu', ())}\n\nPreset `fast`, six images of 1,536 × 1,536 pixels; median of {settings.runs} runs "
+        f"of the command, each in a process of its own.\n\n{table(header, rows)}"
+    )
+    write_section("The whole command on cpu", text)
+
+
+if __name__ == "__main__":
+    main()
