@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from femoreg_torch.errors import InputError
 
 _MOST_ATTENUATION = 12.0  # of a patient: 45 cm of water at 60 keV are 9
-_DARKEST = 60.0  # attenuation of which float32 can still take the intensity
+_EXTREME = 60.0  # attenuation of which float32 can still take the intensity
 _SPARSE = 8  # every so many-th pixel tells what half of an image is
 _SIGMA_PX = math.sqrt(2.0)  # of the smoothing that finds I0: variance 2 px², as xReg does (itkIntensLogTrans)
 
@@ -41,7 +41,6 @@ def binned(attenuation: Tensor, factor: int) -> Tensor:
     Such pixels average intensities. Where half of the image is darker than any patient, the values are no natural
     logarithms of intensities (but grey values, say) and are averaged themselves.
     """
-    least = attenuation.min()
-    if attenuation[::_SPARSE, ::_SPARSE].median() - least > _MOST_ATTENUATION:
+    if attenuation[::_SPARSE, ::_SPARSE].median() - attenuation.min() > _MOST_ATTENUATION:
         return downsample(attenuation, factor)
-    return least - downsample((least - attenuation).clamp_min(-_DARKEST).exp(), factor).log()
+    return -downsample((-attenuation).clamp(-_EXTREME, _EXTREME).exp(), factor).log()

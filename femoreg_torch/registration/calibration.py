@@ -57,7 +57,8 @@ _MOST_ATTENUATION = 2.5  # 1/mm: steel at 45 keV, of which 2 mm are opaque
 _VARIATION = 5.0  # weight of a step of 1/mm between all blocks
 _FLAT = 0.01  # 1/mm: steps that are none
 _MISFIT = 0.05  # of a logarithm of intensity; larger ones (something else has changed) count less
-_ROUNDS = 2  # for blocks, and again for materials
+_FEWEST_ROUNDS, _MOST_ROUNDS = 2, 4  # for blocks, and again for materials
+_STILL = np.array([0.25] * 3 + [0.15] * 3)  # units of the pose: a round that moves it less is the last
 _ITERATIONS, _FEWER = 200, 40  # of L-BFGS from nothing, and from the round before
 _TWIST = np.array([0.01] * 3 + [1.0] * 3)  # rad and mm: one unit of the pose
 _MOST_DEG, _MOST_MM = 8.0, 12.0  # that the device may move; more means that the images do not show it as it is
@@ -202,16 +203,19 @@ def _settled(
     How the images change as the device moves is linear in each of them, and taken anew in the next.
     """
     evaluations = 0
-    for _ in range(_ROUNDS):
+    for number in range(1, _MOST_ROUNDS + 1):
         volume = device.filled(fit[: device.regions])
         seen = _views(scene, poses, device, [view.view for view in seen], volume)
         fit, used = _solve(seen, device, fit, _FEWER)
         evaluations += used
+        still = (np.abs(fit[-6:]) < _STILL).all()
         pose = poses.camera1_from[device.name]
         centre = transform_points(pose, scene.objects[device.name].reference_point[None])[0]
         motion = about_point(exp_se3(torch.from_numpy(fit[-6:] * _TWIST)[None]), centre)[0]
         poses = poses.with_object(device.name, motion @ pose)
         fit[-6:] = 0
+        if still and number >= _FEWEST_ROUNDS:
+            break
     return poses, fit, seen, evaluations
 
 
