@@ -26,6 +26,7 @@ lint: setup
 bench: setup
 	$(BIN)/python benchmarks/drr.py
 	$(BIN)/python benchmarks/scaling.py
+	$(BIN)/python benchmarks/refinement.py
 
 bench-gpu: setup
 	$(BIN)/python benchmarks/drr.py --device cuda

@@ -4,11 +4,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pydicom
 import SimpleITK as sitk
 import torch
-from pydicom.errors import InvalidDicomError
-from pydicom.pixels import apply_rescale
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
@@ -34,6 +31,10 @@ def _read_itk(path: Path) -> np.ndarray:
 
 
 def _read_dicom(path: Path) -> np.ndarray:
+    import pydicom  # a fifth of a second, and most images are of other kinds
+    from pydicom.errors import InvalidDicomError
+    from pydicom.pixels import apply_rescale
+
     try:
         dataset = pydicom.dcmread(path)
     except InvalidDicomError as error:

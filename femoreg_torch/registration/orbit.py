@@ -94,7 +94,6 @@ def _costs(scene: Scene, poses: Poses, search: OrbitSearch, kind: Kind, view: in
     names = scene.shown(chosen_objects(search.render, poses), kind)
     where = torch.stack([orbit @ poses.camera1_from[name] for name in names], 1)  # (N, O, 4, 4)
     camera = poses.camera(view, search.level.camera(scene.carm.camera))
-    drawn = project(
-        [search.level.volume(scene.objects[name].volume) for name in names], where, camera, search.level.step_mm
-    )
+    volumes = [search.level.volume(scene.objects[name].volume) for name in names]
+    drawn = project(volumes, where, camera, search.level.step_mm)
     return prepared(scene, (kind, view), search.level, search.similarity)(drawn)

@@ -4,20 +4,24 @@ Closedness and orientation are trimesh's. Its voxels, however, are either inside
 the fraction of each that is inside, or thin walls come out by up to half a voxel too thick or thin.
 """
 
+from typing import TYPE_CHECKING
+
 import numba
 import numpy as np
 import torch
-import trimesh
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume.attenuation import hu_to_attenuation
 from femoreg_torch.volume.grid import Volume, axis_aligned
 
+if TYPE_CHECKING:
+    import trimesh
+
 _SUB = 4  # columns of sub-samples per voxel side; along the columns the coverage is exact
 _MARGIN = 2  # empty voxels around the mesh
 
 
-def check_closed(mesh: trimesh.Trimesh, where: str) -> trimesh.Trimesh:
+def check_closed(mesh: "trimesh.Trimesh", where: str) -> "trimesh.Trimesh":
     """`mesh` itself, with outward normals, if it is closed. Raises `InputError` that names `where` if it is not."""
     if len(mesh.faces) == 0:
         raise InputError(f"{where}: the mesh holds no triangle.")
@@ -75,7 +79,7 @@ def _accumulate(triangles: np.ndarray, coverage: np.ndarray) -> None:  # pragma:
                 coverage[k + 1, j // _SUB, i // _SUB] += sign * (1.0 - above)
 
 
-def voxelise_mesh(mesh: trimesh.Trimesh, spacing_mm: float, hu: float) -> Volume:
+def voxelise_mesh(mesh: "trimesh.Trimesh", spacing_mm: float, hu: float) -> Volume:
     """Attenuation (1/mm) of a solid of `hu` within a closed mesh, on cubic voxels along the mesh's own axes.
 
     Each voxel is weighted by the fraction of it that lies inside (exact along z, 4 × 4 sub-samples across), so that
@@ -96,7 +100,7 @@ def empty_grid(bounds: np.ndarray, spacing_mm: float) -> Volume:
     return Volume(torch.zeros(*size[::-1].tolist()), axis_aligned((spacing_mm, spacing_mm, spacing_mm), (x, y, z)))
 
 
-def mesh_share(mesh: trimesh.Trimesh, grid: Volume) -> torch.Tensor:
+def mesh_share(mesh: "trimesh.Trimesh", grid: Volume) -> torch.Tensor:
     """The fraction of each voxel of a grid (Z, Y, X) along the axes of the mesh that lies inside the closed mesh."""
     lowest = (grid.lps_from_index[:3, 3] - 0.5 * grid.lps_from_index[:3, :3].sum(1)).numpy()
     # the tiny shift keeps vertices and edges of CAD with round numbers off the columns, where they would count twice

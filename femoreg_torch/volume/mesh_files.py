@@ -2,29 +2,33 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume.mesh import check_closed
 
+if TYPE_CHECKING:
+    import trimesh
+
 _SHORTEST_MM, _LONGEST_MM = 5.0, 2000.0  # of a device; beyond them the file is likely in metres, inches or µm
 
 
-def read_mesh(path: Path) -> trimesh.Trimesh:
+def read_mesh(path: Path) -> "trimesh.Trimesh":
     """A closed surface in mm from an STL, PLY, OBJ, OFF, 3MF or GLB file, equal vertices merged.
 
     Bodies of a file that holds several are taken together. Raises `InputError`.
     """
+    import trimesh
+
     bodies = _load(Path(path), split_objects=False, split_groups=False)
     whole = trimesh.util.concatenate(list(bodies.values()))
     assert isinstance(whole, trimesh.Trimesh)  # as all bodies are
     return check_closed(whole, str(path))
 
 
-def read_bodies(path: Path, names: Sequence[str]) -> dict[str, trimesh.Trimesh]:
+def read_bodies(path: Path, names: Sequence[str]) -> "dict[str, trimesh.Trimesh]":
     """The closed bodies in mm of a 3MF, GLB or OBJ file by name, in the order of `names`.
 
     Bodies of an OBJ file are its objects, or its groups where it has not more than one object. Raises `InputError`
@@ -45,7 +49,7 @@ def read_bodies(path: Path, names: Sequence[str]) -> dict[str, trimesh.Trimesh]:
     return {name: check_closed(bodies[name], f"{path}, body {name}") for name in names}
 
 
-def bounds_of(meshes: Sequence[trimesh.Trimesh], where: str) -> np.ndarray:
+def bounds_of(meshes: "Sequence[trimesh.Trimesh]", where: str) -> np.ndarray:
     """The lowest and the highest corner (2, 3) of the meshes of a device, mm.
 
     Raises `InputError` that starts with `where` if no device is of that size.
@@ -61,8 +65,10 @@ def bounds_of(meshes: Sequence[trimesh.Trimesh], where: str) -> np.ndarray:
     return bounds
 
 
-def _load(path: Path, split_objects: bool, split_groups: bool) -> dict[str, trimesh.Trimesh]:
+def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, trimesh.Trimesh]":
     """The surfaces of a file by name, where they stand in the file's scene, in mm. OBJ files can be split."""
+    import trimesh  # takes most of a second, which reading of the CT hides
+
     if not path.is_file():
         raise InputError(f"{path}: no such file.")
     if path.suffix.lower() in (".step", ".stp"):

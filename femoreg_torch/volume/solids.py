@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from scipy import ndimage
 from torch import Tensor
 
@@ -16,6 +16,9 @@ from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.mesh import empty_grid, mesh_share
 from femoreg_torch.volume.mesh_files import bounds_of
 
+if TYPE_CHECKING:
+    import trimesh
+
 _AIR_HU = -1000.0
 _LEAST_LEFT = 0.01  # of a solid, beside those that replace it
 
@@ -24,7 +27,7 @@ _LEAST_LEFT = 0.01  # of a solid, beside those that replace it
 class Solid:
     """A solid in the space of its device: a closed mesh in mm, or the share of each voxel that it fills."""
 
-    shape: trimesh.Trimesh | Volume
+    shape: "trimesh.Trimesh | Volume"
     hu: float
     name: str  # in messages
 
@@ -51,7 +54,7 @@ def solid_volumes(solids: Sequence[Solid], spacing_mm: float) -> tuple[Volume, .
 def _bounds(solids: Sequence[Solid]) -> np.ndarray:
     """The lowest and the highest corner (2, 3) of all solids, mm."""
     corners = [_corners(solid.shape) for solid in solids if isinstance(solid.shape, Volume)]
-    meshes = [solid.shape for solid in solids if isinstance(solid.shape, trimesh.Trimesh)]
+    meshes = [solid.shape for solid in solids if not isinstance(solid.shape, Volume)]
     if meshes:
         corners.append(bounds_of(meshes, solids[0].name))
     every = np.concatenate(corners)
@@ -64,7 +67,7 @@ def _corners(volume: Volume) -> np.ndarray:
     return transform_points(volume.lps_from_index, torch.cartesian_prod(*last)).numpy()
 
 
-def _share(shape: trimesh.Trimesh | Volume, grid: Volume) -> Tensor:
+def _share(shape: "trimesh.Trimesh | Volume", grid: Volume) -> Tensor:
     """How much of each voxel of the grid (Z, Y, X) the solid fills."""
     if not isinstance(shape, Volume):
         return mesh_share(shape, grid)
