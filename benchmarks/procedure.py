@@ -79,7 +79,7 @@ def main() -> None:
         one_run(settings.case, cores)  # fills the caches of compiled code and of the file system
         runs = [one_run(settings.case, cores) for _ in range(settings.runs)]
         columns.append({part: median(run[0][part] for run in runs) for part in runs[0][0]})
-        evaluations = runs[0][1]
+        evaluations = evaluations or runs[0][1]
         peaks.append(max(run[2] for run in runs))
     rows = [
         [part, str(evaluations.get(part, "")), *(f"{column[part]:.2f}" for column in columns)] for part in columns[0]
