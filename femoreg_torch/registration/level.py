@@ -11,10 +11,11 @@ from torch.nn import functional as F
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import Camera
-from femoreg_torch.volume import Volume, halved
+from femoreg_torch.volume import Volume, changes_in_place, halved
 
 _ROUNDING_MM = 1e-6
-_halves: WeakKeyDictionary[Volume, Volume] = WeakKeyDictionary()  # volumes on voxels twice as large, for later stages
+# Volumes on voxels twice as large, for later stages, and the version of the data that they were made of.
+_halves: WeakKeyDictionary[Volume, tuple[int, Volume]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -34,15 +35,17 @@ class Level:
 
     def image(self, image: Tensor, camera: Camera) -> Tensor:
         """An attenuation image (H, W) of the given camera with the pixels of this level."""
-        return _binned(image, image._version, binning(self.pixel_mm, camera))
+        return _binned(image, changes_in_place(image), binning(self.pixel_mm, camera))
 
     def volume(self, volume: Volume) -> Volume:
         """A volume with voxels as large as the steps of this level allow: its own, or twice, four times … as large."""
         if 2 * max(volume.spacing_mm) > self.step_mm + _ROUNDING_MM:
             return volume
-        if volume not in _halves:
-            _halves[volume] = halved(volume)
-        return self.volume(_halves[volume])
+        version, half = _halves.get(volume, (-1, volume))
+        if version != changes_in_place(volume.data):
+            half = halved(volume)
+            _halves[volume] = changes_in_place(volume.data), half
+        return self.volume(half)
 
     def field(self, exposed: Tensor, camera: Camera) -> Tensor:
         """The pixels of this level, bool, that lie wholly in a mask (H, W) of the given camera."""

@@ -3,7 +3,7 @@
 from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
 from femoreg_torch.volume.bones import BoneLabels, bone_labels
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
-from femoreg_torch.volume.grid import Volume, axis_aligned
+from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
 from femoreg_torch.volume.labels import label_box_centre
 from femoreg_torch.volume.landmarks import check_inside, read_landmarks, write_landmarks
 from femoreg_torch.volume.mesh import check_closed, voxelise_mesh
@@ -20,6 +20,7 @@ __all__ = [
     "axis_aligned",
     "bone_labels",
     "bounds_of",
+    "changes_in_place",
     "check_closed",
     "check_inside",
     "crop",

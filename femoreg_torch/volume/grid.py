@@ -42,6 +42,14 @@ class Volume:
         return Volume(data, self.lps_from_index)
 
 
+def changes_in_place(data: Tensor) -> int:
+    """How often a tensor was changed in place, for what is derived from it; 0 for one that does not count that.
+
+    Tensors made under `torch.inference_mode` do not.
+    """
+    return 0 if data.is_inference() else data._version
+
+
 def axis_aligned(spacing_mm: tuple[float, float, float], origin_mm: tuple[float, float, float]) -> Tensor:
     """`lps_from_index` (4, 4) of a grid along the axes; the origin is the centre of the first voxel."""
     affine = torch.eye(4, dtype=torch.float64)

@@ -9,10 +9,12 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import transform_points
-from femoreg_torch.volume.grid import Volume
+from femoreg_torch.volume.grid import Volume, changes_in_place
 
 Corner = tuple[int, int, int]  # x, y, z
-_boxes: WeakKeyDictionary[Volume, list[tuple[slice, slice, slice] | None]] = WeakKeyDictionary()  # of a map's labels
+_Boxes = list[tuple[slice, slice, slice] | None]
+# Of the labels of a map, and the version of the data that they were found in.
+_boxes: WeakKeyDictionary[Volume, tuple[int, _Boxes]] = WeakKeyDictionary()
 
 
 def label_box(labels: Volume, ids: Sequence[int]) -> tuple[Corner, Corner]:
@@ -20,9 +22,10 @@ def label_box(labels: Volume, ids: Sequence[int]) -> tuple[Corner, Corner]:
 
     Raises `InputError` if none of the ids occurs.
     """
-    if labels not in _boxes:
-        _boxes[labels] = ndimage.find_objects(labels.data.numpy())
-    boxes = _boxes[labels]
+    version, boxes = _boxes.get(labels, (-1, []))
+    if version != changes_in_place(labels.data):
+        boxes = ndimage.find_objects(labels.data.numpy())
+        _boxes[labels] = changes_in_place(labels.data), boxes
     found = [box for n in ids if n <= len(boxes) and (box := boxes[n - 1]) is not None]
     if not found:
         raise InputError(f"label map: no voxel carries any of the labels {list(ids)}. Check `structures` against it.")

@@ -59,6 +59,8 @@ def test_voxels_are_as_large_as_the_steps_allow() -> None:
     assert twice.spacing_mm == pytest.approx((2.0, 2.0, 1.0))
     assert Level(6.0, 3.0).volume(volume) is twice  # made once
     assert Level(6.0, 4.0).volume(volume).spacing_mm == pytest.approx((4.0, 4.0, 2.0))
+    volume.data.add_(1)  # in place: made anew
+    torch.testing.assert_close(Level(3.0, 2.0).volume(volume).data, twice.data + 1)
 
 
 def test_an_image_that_changes_in_place_is_averaged_anew() -> None:
