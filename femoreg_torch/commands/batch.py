@@ -167,12 +167,14 @@ def run_job(job: Job) -> Row:
     import time
     import traceback
 
+    import numba
     import torch
 
     from femoreg_torch.commands.register import register_into
     from femoreg_torch.errors import InputError
 
     torch.set_num_threads(job.threads)
+    numba.set_num_threads(job.threads)  # or its kernels take all cores, and torch's next ones with them
     began = time.perf_counter()
     try:
         result, _ = register_into(job.out, job.case, job.preset, job.seed, weights=job.weights)

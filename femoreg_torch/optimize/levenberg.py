@@ -11,6 +11,8 @@ _DAMPING = 1e-3  # at the start, relative to the curvature of each degree of fre
 _SOFTEST = 1e-4  # least curvature that counts, relative to the mean
 _LEAST_DAMPING = 1e-7
 _MOST_DAMPING = 1e4
+_SOFT = 5  # directions that are looked along for the bottom of a valley
+_FLAT = 1e-9  # second difference of values that is none
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,10 @@ class LevenbergMarquardt:
     K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, DTU 2004, algorithm 3.16.
     With `candidates`, so many random deltas of deviation one are looked at first, and the best `starts` of them and
     zero are refined; the search ends with the best of these.
+
+    An objective that is drawn from voxels ripples. Where it is soft, the ripples hold a descent up well before the
+    minimum of what lies beneath. With `valley` the search goes on, along each of the five directions of least curvature,
+    to the minimum of the parabola through the values there and so far to both sides, where ripples weigh little.
     """
 
     max_iterations: int = 20  # per start
@@ -27,6 +33,7 @@ class LevenbergMarquardt:
     tol_f: float = 1e-7  # improvement that a step promises
     candidates: int = 0
     starts: int = 1
+    valley: float = 0.0  # half-length of the parabolas along the softest directions, in units of the scales; 0: none
 
     def minimise(self, objective: Objective, n: int, seed: int) -> Result:
         """Minimise over deltas (n,), from zero and from random starts. Evaluations count quadratics and values alike.
@@ -45,7 +52,8 @@ class LevenbergMarquardt:
         found = [_descend(track, objective, start, self) for start in starts]
         best = min(found, key=lambda end: end.value)
         ends = tuple((end.value, tuple(end.delta.tolist())) for end in found) if len(found) > 1 else ()
-        return replace(track.result(best.stop), ends=ends)
+        result = replace(track.result(best.stop), ends=ends)
+        return _in_the_valley(track, result, best.hessian, self.valley) if self.valley else result
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +63,7 @@ class _End:
     stop: Stop
     value: float
     delta: torch.Tensor  # (n,)
+    hessian: torch.Tensor  # (n, n) there
 
 
 def _descend(track: BestSoFar, objective: SmoothObjective, start: torch.Tensor, settings: LevenbergMarquardt) -> _End:
@@ -69,9 +78,9 @@ def _descend(track: BestSoFar, objective: SmoothObjective, start: torch.Tensor, 
         step = -torch.linalg.solve(damped, model.gradient)
         promised = float(-(model.gradient @ step) - 0.5 * step @ model.hessian @ step)
         if float(step.norm()) < settings.tol_x:
-            return _End(Stop.SMALL_STEP, model.value, here)
+            return _End(Stop.SMALL_STEP, model.value, here, model.hessian)
         if promised < settings.tol_f:
-            return _End(Stop.FLAT, model.value, here)
+            return _End(Stop.FLAT, model.value, here, model.hessian)
         trial = _quadratic(track, objective, here + step)
         ratio = (model.value - trial.value) / promised
         if ratio > 0:
@@ -81,8 +90,22 @@ def _descend(track: BestSoFar, objective: SmoothObjective, start: torch.Tensor, 
         else:
             damping, growth = damping * growth, growth * 2
             if damping > _MOST_DAMPING:
-                return _End(Stop.ROUNDOFF, model.value, here)
-    return _End(Stop.BUDGET, model.value, here)
+                return _End(Stop.ROUNDOFF, model.value, here, model.hessian)
+    return _End(Stop.BUDGET, model.value, here, model.hessian)
+
+
+def _in_the_valley(track: BestSoFar, result: Result, hessian: torch.Tensor, half_length: float) -> Result:
+    """The result moved along each of the softest directions to the minimum of the parabola through three values."""
+    softest = torch.linalg.eigh(hessian).eigenvectors.T[:_SOFT]
+    aside = half_length * softest / softest.abs().amax(1, keepdim=True)
+    below, above = track(torch.cat([result.delta - aside, result.delta + aside])).double().chunk(2)
+    slope, bend = (above - below) / 2, above + below - 2 * result.value
+    # Where nothing but rounding bends the values, no data hold the direction.
+    way = torch.where(bend > _FLAT, -slope / bend.clamp(min=_FLAT), torch.zeros_like(bend)).clamp(-1, 1)
+    delta = result.delta + way @ aside
+    value = float(track(delta[None])[0])
+    trace = (*result.trace, (track.evaluations, value, tuple(delta.tolist())))
+    return replace(result, delta=delta, value=value, evaluations=track.evaluations, trace=trace)
 
 
 def _quadratic(track: BestSoFar, objective: SmoothObjective, delta: torch.Tensor) -> Quadratic:

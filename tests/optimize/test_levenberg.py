@@ -69,6 +69,39 @@ def test_same_seed_same_bits() -> None:
     assert first.trace != other.trace
 
 
+def rippled(softness: float) -> SmoothObjective:
+    """A bowl about (0.3, −0.2), soft along (1, 1), with ripples along it that its curvature does not know of."""
+    bottom = torch.tensor([0.3, -0.2], dtype=torch.float64)
+    along = torch.tensor([1.0, 1.0], dtype=torch.float64) / 2**0.5
+    curvature = torch.eye(2, dtype=torch.float64) + (softness - 1) * along.outer(along)
+
+    def values(deltas: Tensor) -> Tensor:
+        away = deltas - bottom
+        return 0.5 * (away * (away @ curvature)).sum(1) + 1e-4 * torch.cos(40 * away @ along)
+
+    def quadratic(delta: Tensor) -> Quadratic:
+        slope = curvature @ (delta - bottom) - 40 * 1e-4 * torch.sin(40 * (delta - bottom) @ along) * along
+        return Quadratic(float(values(delta[None])[0]), slope[None], curvature)
+
+    return SmoothObjective(values, quadratic)
+
+
+def test_a_parabola_over_the_valley_finds_its_bottom_beneath_the_ripples() -> None:
+    bottom = torch.tensor([0.3, -0.2], dtype=torch.float64)
+    held_up = LevenbergMarquardt().minimise(rippled(1e-2), 2, seed=0)
+    smooth = LevenbergMarquardt(valley=0.4).minimise(rippled(1e-2), 2, seed=0)
+    assert float((held_up.delta - bottom).norm()) > 0.05
+    assert float((smooth.delta - bottom).norm()) < 0.03
+    assert smooth.evaluations == held_up.evaluations + 5
+    torch.testing.assert_close(torch.tensor(smooth.trace[-1][2], dtype=torch.float64), smooth.delta)
+
+
+def test_where_nothing_holds_a_direction_no_parabola_is_followed() -> None:
+    loose = squares(lambda d: torch.stack([d[0] - 1, 0 * d[1]]))
+    result = LevenbergMarquardt(tol_f=1e-14, valley=0.4).minimise(loose, 2, seed=0)
+    torch.testing.assert_close(result.delta, torch.tensor([1.0, 0.0], dtype=torch.float64), atol=1e-6, rtol=0)
+
+
 def test_needs_derivatives() -> None:
     with pytest.raises(TypeError, match="SmoothObjective"):
         LevenbergMarquardt().minimise(lambda deltas: deltas.square().sum(1), 2, seed=0)
