@@ -23,9 +23,9 @@ class LevenbergMarquardt:
     With `candidates`, so many random deltas of deviation one are looked at first, and the best `starts` of them and
     zero are refined; the search ends with the best of these.
 
-    An objective that is drawn from voxels ripples. Where it is soft, the ripples hold a descent up well before the
-    minimum of what lies beneath. With `valley` the search goes on, along each of the five directions of least curvature,
-    to the minimum of the parabola through the values there and so far to both sides, where ripples weigh little.
+    An objective that is drawn from voxels ripples. Where it is soft, ripples hold a descent up well before the minimum
+    of what lies beneath. With `valley` the search goes on: along each of the five directions of least curvature, to the
+    minimum of the parabola through the values there and so far to both sides, where ripples weigh little.
     """
 
     max_iterations: int = 20  # per start
