@@ -1,6 +1,7 @@
 """Gaussian blur of volumes, compiled and on all cores. The result does not depend on how many there are."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -10,7 +11,10 @@ Array = NDArray[np.float32]
 
 
 def gaussian_filter(
-    values: Array, sigma: float | Sequence[float], truncate: float = 4.0, out: Array | None = None
+    values: Array,
+    sigma: float | Sequence[float] | NDArray[np.floating[Any]],
+    truncate: float = 4.0,
+    out: Array | None = None,
 ) -> Array:
     """A volume (A, B, C) blurred by a Gaussian of `sigma` voxels, one for all axes or one each; the border is mirrored.
 

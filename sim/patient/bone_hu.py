@@ -116,9 +116,9 @@ def bone_hu(
     150, fatty marrow -30; the cortex thickness runs from 1.25 mm (iliac wing) to 4.4 mm (shaft).
     """
     box = field.within(*axes.lists())
-    depth = -field.on_axes(*(axis[part] for axis, part in zip(axes.lists(), box, strict=True)))
+    depth = -field.across_slices(*(axis[part] for axis, part in zip(axes.lists(), box, strict=True)))
     within = np.nonzero(depth > -spacing_mm / 2)
-    x, y, z = (index + part.start for index, part in zip(within, box, strict=True))
+    x, y, z = (index + part.start for index, part in zip(within[::-1], box, strict=True))
     depth = depth[within]
     grain, patches = (noise.at_voxels(axes.lists(), (x, y, z)) for noise in (texture.grain, texture.patches))
     points = axes.x[x], axes.y[y], axes.z[z]

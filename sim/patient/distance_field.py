@@ -91,6 +91,11 @@ class Field:
         """Trilinear values (X, Y, Z) on the grid of three rising lists of mm; beyond this field those of its edge."""
         return _on_axes(np.ascontiguousarray(self.values), *self.places(x, y, z))
 
+    def across_slices(self, x: Points, y: Points, z: Points) -> Array:
+        """The same as (Z, Y, X)."""
+        i, u, j, v, k, w = self.places(x, y, z)
+        return _on_axes(np.ascontiguousarray(self.values.T), k, w, j, v, i, u)
+
     def at_voxels(self, axes: tuple[Points, Points, Points], voxels: Sequence[NDArray[np.intp]]) -> Array:
         """The same at some voxels (N,) of that grid, given by their indices along x, y, z."""
         return _at_voxels(np.ascontiguousarray(self.values), *self.places(*axes), *voxels)

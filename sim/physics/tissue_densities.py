@@ -12,13 +12,13 @@ from collections.abc import Sequence
 import numba as nb
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.volume import Volume, crop
 from femoreg_torch.volume.labels import label_box
 from sim.physics.bone_rims import RIM_MM, bone_opacities
 from sim.physics.materials import WATER_PER_BONE, tissue_densities
+from sim.smoothing import gaussian_filter
 
 COARSE_MM = 1.5  # about the voxels of the filled density
 _BONE_HU = 200.0  # denser voxels count as bone also where nothing is labelled
@@ -65,7 +65,7 @@ def _densities(ct: Volume, labels: Volume, factor: int) -> tuple[Volume, Volume,
     hu, known = ct.data.numpy(), np.zeros([n // factor for n in ct.data.shape], np.float32)
     _mark_bone(hu, labels.data.numpy(), np.float32(_BONE_HU), factor, known)
     sigma = RIM_MM / factor / np.array(ct.spacing_mm[::-1])
-    near = ndimage.gaussian_filter(known, sigma, truncate=3)
+    near = gaussian_filter(known, sigma, truncate=3)
     opacity = np.maximum(np.clip(near / np.float32(0.15), 0, 1), known)
     spans = [np.flatnonzero((opacity > 0).any(axes)) for axes in ((1, 2), (0, 2), (0, 1))]
     first, end = ([int(span[at]) for span in spans] for at in (0, -1))
@@ -104,9 +104,15 @@ def _split(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """
     depth, height, width = filled.shape
     for k in nb.prange(depth):
+        around = np.empty(width, np.float32)
         for j in range(height):
+            around[:] = 0  # the highest opacity of the row and its eight neighbours
+            for p in range(max(k - 1, 0), min(k + 2, depth)):
+                for q in range(max(j - 1, 0), min(j + 2, height)):
+                    for i in range(width):
+                        around[i] = max(around[i], opacity[p, q, i])
             for i in range(width):
-                near = opacity[max(k - 1, 0) : k + 2, max(j - 1, 0) : j + 2, max(i - 1, 0) : i + 2].max() > 0
+                near = around[i] > 0 or around[max(i - 1, 0)] > 0 or around[min(i + 1, width - 1)] > 0
                 mean = 0.0
                 for z in range(k * factor, (k + 1) * factor):
                     for y in range(j * factor, (j + 1) * factor):

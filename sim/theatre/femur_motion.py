@@ -19,6 +19,7 @@ from torch import Tensor
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume import Volume
 from sim.physics.bone_rims import bone_opacities
+from sim.smoothing import gaussian_filter
 
 _FALL_OFF_MM = 30.0  # distance from the femur over which the soft tissue comes to rest
 _MARGIN_MM = _FALL_OFF_MM + 2.0
@@ -108,7 +109,7 @@ def _bent_soft_tissue(before: Array, bone: Array, moved_femur: Array, box: _Box,
     steps = (np.array(before.shape) - 1) / (np.array(shape) - 1)  # voxels per coarse one
     far = _resized(moved_femur, shape) <= 0.5
     distance = ndimage.distance_transform_edt(far, sampling=steps * box.spacing_zyx)
-    weight = ndimage.gaussian_filter(np.clip(1 - distance / _FALL_OFF_MM, 0, 1) ** 2, 1.5)
+    weight = gaussian_filter((np.clip(1 - distance / _FALL_OFF_MM, 0, 1) ** 2).astype(np.float32), 1.5)
 
     axes, origin = box.lps_from_index[:3, :3], box.lps_from_index[:3, 3]
     index = np.indices(shape).reshape(3, -1).T * steps
@@ -133,8 +134,8 @@ def _fill(before: Array, bone: Array, factor: tuple[float, ...]) -> Array:
     fill, known = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for width_mm in (3.0, 9.0, 27.0):
         sigma = width_mm / _COARSE_MM
-        weight = ndimage.gaussian_filter(share, sigma)
-        average = ndimage.gaussian_filter(values, sigma) / np.maximum(weight, 1e-6)
+        weight = gaussian_filter(share, sigma)
+        average = gaussian_filter(values, sigma) / np.maximum(weight, 1e-6)
         trust = np.clip(weight / 0.1, 0, 1) * (1 - known)
         fill += trust * average
         known += trust
