@@ -109,9 +109,11 @@ def _record(hu: Array, air: Mask, spacing: float, rng: np.random.Generator) -> N
     gaussian_filter(hu, BLUR_MM / spacing, out=hu)
     depth, height, width = hu.shape
     slab = max(1, int(32 / spacing))
+    drawn = np.empty(width * height * min(slab, depth), np.float32)  # one for all slabs: to touch new memory takes long
     for low in range(0, depth, slab):
         part = slice(low, min(low + slab, depth))
-        noise = rng.standard_normal((width, height, part.stop - low), dtype=np.float32)
+        noise = drawn[: width * height * (part.stop - low)].reshape(width, height, -1)
+        rng.standard_normal(out=noise, dtype=np.float32)
         gaussian_filter(noise, 0.55, out=noise)
         _add_noise(hu[part], air[part], noise, np.float32(NOISE_HU / np.sqrt(spacing) / noise.std()))
 

@@ -33,16 +33,9 @@ def separate(
     label map lacks one of the bones.
     """
     factor = max(1, round(COARSE_MM / min(ct.spacing_mm)))
-    ct, labels = _whole_blocks(ct, factor), _whole_blocks(labels, factor)
     filled, bone, names = _densities(ct, labels, factor)
     moving = [_cut_out(bone, names, ids) for ids in movable]
     return filled, bone, moving, Volume(_middles(labels.data, factor), filled.lps_from_index)
-
-
-def _whole_blocks(volume: Volume, factor: int) -> Volume:
-    """The volume without what fills no whole block of `factor` voxels along each axis at the far faces."""
-    z, y, x = (n // factor * factor for n in volume.data.shape)
-    return volume if (z, y, x) == tuple(volume.data.shape) else crop(volume, (0, 0, 0), (x, y, z))
 
 
 def _coarse_affine(volume: Volume, factor: int) -> Tensor:
@@ -53,14 +46,15 @@ def _coarse_affine(volume: Volume, factor: int) -> Tensor:
 
 
 def _middles(data: Tensor, factor: int) -> Tensor:
-    return data[factor // 2 :: factor, factor // 2 :: factor, factor // 2 :: factor].contiguous()
+    z, y, x = (slice(factor // 2, n // factor * factor, factor) for n in data.shape)
+    return data[z, y, x].contiguous()
 
 
 def _densities(ct: Volume, labels: Volume, factor: int) -> tuple[Volume, Volume, Volume]:
     """The filled density on blocks of `factor` voxels, the density of bone on the CT's voxels, cropped, and its labels.
 
     Bone is what is labelled or dense, with its partial-volume rim. Elsewhere all is soft tissue: what noise lifts above
-    the HU of muscle there is no bone.
+    the HU of muscle there is no bone. What fills no whole block at the far faces is left out.
     """
     hu, known = ct.data.numpy(), np.zeros([n // factor for n in ct.data.shape], np.float32)
     _mark_bone(hu, labels.data.numpy(), np.float32(_BONE_HU), factor, known)

@@ -59,11 +59,14 @@ def rotate_femur(ct: Volume, labels: Volume, femur: tuple[int, ...], rotation: T
     femur_alpha, rest_alpha = bone_opacities(moving, resting, box.spacing_zyx)
     matrix, offset = _index_turn(box, turn, centre)
     moved_alpha = ndimage.affine_transform(femur_alpha, matrix, offset, order=1, mode="nearest")
-    moved_femur = ndimage.affine_transform(before, matrix, offset, order=3, mode="nearest")
-    np.clip(moved_femur, before.min(), before.max(), out=moved_femur)
 
     after = _bent_soft_tissue(before, np.maximum(femur_alpha, rest_alpha), moved_alpha, box, turn, centre)
-    after += moved_alpha * (moved_femur - after)
+    part = _where(moved_alpha > 0)
+    start = matrix @ [axis.start for axis in part] + offset
+    size = after[part].shape
+    moved_femur = ndimage.affine_transform(before, matrix, start, output_shape=size, order=3, mode="nearest")
+    np.clip(moved_femur, before.min(), before.max(), out=moved_femur)
+    after[part] += moved_alpha[part] * (moved_femur - after[part])
     after += rest_alpha * (before - after)
     after[resting] = before[resting]
 
@@ -89,6 +92,13 @@ def _box_around(is_femur: Mask, ct: Volume, turn: Matrix, centre: Matrix) -> _Bo
     shifted[:3, 3] += affine[:3, :3] @ low
     x, y, z = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     return _Box((z, y, x), shifted, np.array(ct.spacing_mm)[::-1])
+
+
+def _where(mask: Mask) -> tuple[slice, slice, slice]:
+    """The box of what is set."""
+    spans = [np.flatnonzero(mask.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    z, y, x = (slice(int(span[0]), int(span[-1]) + 1) for span in spans)
+    return z, y, x
 
 
 def _index_turn(box: _Box, turn: Matrix, centre: Matrix) -> tuple[Matrix, Matrix]:
