@@ -45,8 +45,8 @@ _STAGES = {
 Seconds = dict[str, float]
 
 
-def procedure() -> None:
-    """Simulate it under the profiler, and print the seconds of each row as JSON."""
+def procedure(spacings_mm: tuple[float, float]) -> None:
+    """Simulate it under the profiler, and print the seconds of each row as JSON; voxels as in the simulation."""
     import torch
 
     from sim.theatre.case_folders import write_procedural_simulation
@@ -56,7 +56,7 @@ def procedure() -> None:
     with tempfile.TemporaryDirectory() as folder:
         began, used = time.perf_counter(), time.process_time()
         profile.enable()
-        write_procedural_simulation(Path(folder) / "case", 301, 1001, "left", "paper", lambda _: None)
+        write_procedural_simulation(Path(folder) / "case", 301, 1001, "left", "paper", lambda _: None, spacings_mm)
         profile.disable()
         whole = {"whole": time.process_time() - used, "wall": time.perf_counter() - began}
     found: Seconds = {}
@@ -68,11 +68,11 @@ def procedure() -> None:
     print(json.dumps(found | whole | {"peak": peak}))
 
 
-def one_run(cores: int, checkout: Path) -> Seconds:
+def one_run(cores: int, checkout: Path, spacings_mm: tuple[float, float] = (1.0, 0.75)) -> Seconds:
     """Seconds by row of one run of the code in a checkout, the wall clock, and the most memory, MiB."""
     available = sorted(os.sched_getaffinity(0))[:cores]
     environment = os.environ | dict.fromkeys(_THREADS, str(cores)) | {"PYTHONPATH": str(checkout)}
-    arguments = [sys.executable, str(Path(__file__).resolve()), "--procedure"]
+    arguments = [sys.executable, str(Path(__file__).resolve()), "--procedure", *map(str, spacings_mm)]
     done = subprocess.run(
         arguments,
         env=environment,
@@ -92,17 +92,17 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--cores", type=int, nargs="+", default=[2, 1])
     parser.add_argument("--against", type=Path, help="another checkout of this project")
-    parser.add_argument("--procedure", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--procedure", type=float, nargs=2, help=argparse.SUPPRESS)
     settings = parser.parse_args()
     if settings.procedure:
-        procedure()
+        procedure(tuple(settings.procedure))
         return
     here = Path(__file__).resolve().parents[1]
     measured = [(f"{cores} core{'s' * (cores > 1)}", cores, here) for cores in settings.cores]
     if settings.against:
         measured.append((f"before, {measured[-1][0]}", settings.cores[-1], settings.against.resolve()))
     for _, cores, checkout in measured:
-        one_run(cores, checkout)  # fills the caches of compiled code and of the file system
+        one_run(cores, checkout, (2.0, 2.0))  # fills the caches of compiled code and of the file system
     runs = [[one_run(cores, checkout) for _, cores, checkout in measured] for _ in range(settings.runs)]
     columns = [{row: median(run[n][row] for run in runs) for row in runs[0][n]} for n in range(len(measured))]
     rows = [

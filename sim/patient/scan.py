@@ -91,10 +91,10 @@ def _place_bones(body: _Body, axes: Axes, spacing: float, hu: Array, filled: Arr
         _put(*voxels, part, part_hu, LABEL_IDS[name], hu, filled, labels)
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, parallel=True)
 def _put(x, y, z, part, part_hu, label, hu, filled, labels):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """Put one bone into the volumes; what other bones fill of a voxel is theirs, and the greatest share names it."""
-    for n in range(len(part)):
+    for n in nb.prange(len(part)):  # each voxel once
         at = z[n], y[n], x[n]
         before = filled[at]
         share = min(part[n], 1 - before) / max(part[n], np.float32(1e-6))
