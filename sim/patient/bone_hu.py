@@ -1,17 +1,27 @@
 """Hounsfield units inside the bones: cortical shell, spongy bone with its texture, marrow canal."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from sim.patient.distance_field import Array, Field
 from sim.patient.parameters import PatientParameters
 from sim.patient.skeleton import Skeleton
+from sim.smoothing import gaussian_filter
 
 Points = NDArray[np.float64]
+Voxels = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
 MARROW_HU = -30.0  # fatty marrow
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """What makes spongy bone uneven: fields of mean 0 and deviation 1."""
+
+    grain: Field
+    patches: Field
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +40,10 @@ class Axes:
         )
         return x, y, z
 
+    def lists(self) -> tuple[Points, Points, Points]:
+        """x, y, z."""
+        return self.x, self.y, self.z
+
 
 def smooth_noise(rng: np.random.Generator, lo: Points, hi: Points, sigma_mm: float) -> Field:
     """Gaussian random field of mean 0 and deviation 1 from `lo` to `hi` (3,) mm.
@@ -38,8 +52,14 @@ def smooth_noise(rng: np.random.Generator, lo: Points, hi: Points, sigma_mm: flo
     """
     step = max(1.0, sigma_mm / 2)
     shape = np.ceil((hi - lo) / step).astype(int) + 2
-    noise = ndimage.gaussian_filter(rng.standard_normal(shape, dtype=np.float32), sigma_mm / step)
+    noise = gaussian_filter(rng.standard_normal(shape, dtype=np.float32), sigma_mm / step)
     return Field((noise - noise.mean()) / noise.std(), lo, step)
+
+
+def draw_texture(field: Field, rng: np.random.Generator) -> Texture:
+    """The texture of the bone of a distance field."""
+    end = field.lo + field.step * (np.array(field.values.shape) - 1)
+    return Texture(*(smooth_noise(rng, field.lo, end, sigma_mm) for sigma_mm in (0.8, 5.0)))
 
 
 def _ramp(x: Array, x0: float, x1: float, y0: float, y1: float) -> Array:
@@ -47,19 +67,19 @@ def _ramp(x: Array, x0: float, x1: float, y0: float, y1: float) -> Array:
 
 
 def _materials(
-    name: str, axes: Axes, skeleton: Skeleton, texture: Array, grain: Array
+    name: str, points: Sequence[Points], skeleton: Skeleton, texture: Array, grain: Array
 ) -> tuple[Array | float, Array, Array | float]:
-    """Thickness of the cortex mm, HU of spongy bone, HU of cortex; all broadcastable to the box."""
+    """Thickness of the cortex mm, HU of spongy bone, HU of cortex at points (N,) each of x, y, z in mm."""
     if name == "sacrum":
         return 1.0, 170 + 0.8 * texture, 850.0
     if name == "vertebrae":
         return 0.9, 180 + 0.7 * texture, 900.0
     side = name.split("_")[1]
-    dx, dy, dz = axes.relative(skeleton.heads[side])
+    dx, dy, dz = ((p - c).astype(np.float32) for p, c in zip(points, skeleton.heads[side], strict=True))
     radius = skeleton.head_radius
     r = np.sqrt(dx**2 + dy**2 + dz**2)
     if name.startswith("hip"):
-        shell = np.where(r < radius + 8, 2.0, _ramp(dz + 0 * r, 20, 70, 1.7, 1.25)).astype(np.float32)
+        shell = np.where(r < radius + 8, 2.0, _ramp(dz, 20, 70, 1.7, 1.25)).astype(np.float32)
         spongy = _ramp(r, radius + 4, radius + 30, 330, 210) + texture
         return shell, spongy, _ramp(r, radius + 5, radius + 50, 1250, 1050)
     down = -skeleton.lps_from_femur[side][:, 2].astype(np.float32)
@@ -84,23 +104,27 @@ def _materials(
 def bone_hu(
     name: str,
     field: Field,
+    texture: Texture,
     axes: Axes,
     spacing_mm: float,
     skeleton: Skeleton,
     parameters: PatientParameters,
-    rng: np.random.Generator,
-) -> tuple[Array, Array]:
-    """Filled fraction of each voxel of the box (X, Y, Z) and the HU of the bone in it, times that fraction.
+) -> tuple[Voxels, Array, Array]:
+    """Voxels (their indices along x, y, z) that a bone fills, all or in part; that fraction, and HU times it, (N,).
 
     HU follow what CT of the hip shows: cortex 1050 to 1600, spongy bone of the head 300 to 400, of the trochanter about
     150, fatty marrow -30; the cortex thickness runs from 1.25 mm (iliac wing) to 4.4 mm (shaft).
     """
-    depth = -field.on_axes(axes.x, axes.y, axes.z)
-    end = field.lo + field.step * (np.array(field.values.shape) - 1)
-    grain, patches = (smooth_noise(rng, field.lo, end, s).on_axes(axes.x, axes.y, axes.z) for s in (0.8, 5.0))
-    thick, spongy, cortex = _materials(name, axes, skeleton, 55 * grain + 45 * patches, grain)
+    box = field.within(*axes.lists())
+    depth = -field.across_slices(*(axis[part] for axis, part in zip(axes.lists(), box, strict=True)))
+    within = np.nonzero(depth > -spacing_mm / 2)
+    x, y, z = (index + part.start for index, part in zip(within[::-1], box, strict=True))
+    depth = depth[within]
+    grain, patches = (noise.at_voxels(axes.lists(), (x, y, z)) for noise in (texture.grain, texture.patches))
+    points = axes.x[x], axes.y[y], axes.z[z]
+    thick, spongy, cortex = _materials(name, points, skeleton, 55 * grain + 45 * patches, grain)
     filled = np.clip(depth / spacing_mm + 0.5, 0, 1)
     core = np.clip((depth - thick * parameters.cortex) / spacing_mm + 0.5, 0, 1)
     core = np.minimum(core, filled)
     spongy = MARROW_HU + parameters.bone_density * (np.clip(spongy, -60, 650) - MARROW_HU)
-    return filled, ((filled - core) * (cortex + 60 * patches) + core * spongy).astype(np.float32)
+    return (x, y, z), filled, ((filled - core) * (cortex + 60 * patches) + core * spongy).astype(np.float32)

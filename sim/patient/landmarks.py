@@ -8,6 +8,7 @@ symphyseal face; ASIS most anterior point of the iliac wing. Anterior, up and me
 
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -45,8 +46,11 @@ def pelvic_frame(surfaces: dict[str, Points], heads: dict[str, Points]) -> tuple
     left = _unit(heads["left"] - heads["right"])
     up = _unit(np.array([0, 0, 1.0]) - left * left[2])
     asis: dict[str, Points] = {}
+    rows = np.zeros((3, 3))
     for _ in range(20):
-        rows = np.array([left, np.cross(up, left), up])
+        before, rows = rows, np.array([left, np.cross(up, left), up])
+        if np.array_equal(rows, before):
+            break
         pubis = {}
         for side, surface in surfaces.items():
             local = surface @ rows.T
@@ -67,23 +71,48 @@ def _shadow(field: Field, columns: Points, rows: Points, ray: Points) -> Shadow:
         for d, pitch in ((columns, PIXEL_MM), (rows, PIXEL_MM), (ray, 1.5))
     ]
     base = spans[0][:, None, None] * columns + spans[1][None, :, None] * rows
-    least = np.full(base.shape[:2], np.inf, np.float32)
-    depth = np.zeros(base.shape[:2])
-    for t in spans[2]:
-        index = ((base + t * ray - field.lo) / field.step).reshape(-1, 3).T
-        values = ndimage.map_coordinates(field.values, index, order=1, mode="constant", cval=100.0).reshape(least.shape)
-        nearer = values < least
-        least[nearer], depth[nearer] = values[nearer], t
+    least, depth = _least_along(field.values, field.lo, field.step, base, ray, spans[2])
     return Shadow(least, base + depth[..., None] * ray)
 
 
-def _onto_surface(field: Field, point: Points) -> Points:
-    """The surface point reached from a near one along the gradient."""
+@nb.njit(cache=True, parallel=True)
+def _least_along(values, lo, step, base, ray, distances):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    """The least of the trilinear values along rays from `base` (C, R, 3), and how far it is; at first inf, 0."""
+    least = np.full(base.shape[:2], np.inf, np.float32)
+    depth = np.zeros(base.shape[:2])
+    most = np.array(values.shape) - 1.0
+    for c in nb.prange(base.shape[0]):
+        for r in range(base.shape[1]):
+            for t in distances:
+                x = (base[c, r, 0] + t * ray[0] - lo[0]) / step
+                y = (base[c, r, 1] + t * ray[1] - lo[1]) / step
+                z = (base[c, r, 2] + t * ray[2] - lo[2]) / step
+                if 0 <= x <= most[0] and 0 <= y <= most[1] and 0 <= z <= most[2]:
+                    value = _trilinear(values, x, y, z)
+                    if value < least[c, r]:
+                        least[c, r], depth[c, r] = value, t
+    return least, depth
+
+
+@nb.njit(cache=True)
+def _trilinear(values, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    """Value at indices within a volume (X, Y, Z)."""
+    i, j, k = min(int(x), values.shape[0] - 2), min(int(y), values.shape[1] - 2), min(int(z), values.shape[2] - 2)
+    u, v, w = x - i, y - j, z - k
+    c00 = (1 - w) * values[i, j, k] + w * values[i, j, k + 1]
+    c01 = (1 - w) * values[i, j + 1, k] + w * values[i, j + 1, k + 1]
+    c10 = (1 - w) * values[i + 1, j, k] + w * values[i + 1, j, k + 1]
+    c11 = (1 - w) * values[i + 1, j + 1, k] + w * values[i + 1, j + 1, k + 1]
+    return (1 - u) * ((1 - v) * c00 + v * c01) + u * ((1 - v) * c10 + v * c11)
+
+
+def _onto_surface(field: Field, points: Points) -> Points:
+    """The surface points (N, 3) reached from near ones along the gradient."""
     shift = 0.5 * field.step * np.eye(3)
     for _ in range(5):
-        slope = (field.at(point + shift) - field.at(point - shift)) / field.step
-        point = point - field.at(point[None])[0] * slope / max(float(slope @ slope), 0.25)
-    return point
+        slope = np.stack([field.at(points + s) - field.at(points - s) for s in shift], 1) / field.step
+        points = points - (field.at(points) / np.maximum((slope**2).sum(1), 0.25))[:, None] * slope
+    return points
 
 
 def _largest_hole(image: Mask) -> Mask:
@@ -123,7 +152,7 @@ def obturator_rim(field: Field, rows: Points, sign: int) -> Points:
     shadow = _shadow(ring, *_view_through_foramen(inside, rows, sign))
     hole = _largest_hole(shadow.least < 0)
     rim = hole & ndimage.binary_dilation(~hole)
-    return np.array([_onto_surface(field, p) for p in shadow.points[rim]])
+    return _onto_surface(field, shadow.points[rim])
 
 
 def sciatic_notch(field: Field, rows: Points) -> Points:
@@ -143,7 +172,7 @@ def sciatic_notch(field: Field, rows: Points) -> Points:
     bay = parts == int(np.argmax(sizes))
     from_mouth = ndimage.distance_transform_edt(~(bay & ndimage.binary_dilation(~hull)))
     edge = bay & ndimage.binary_dilation(image)
-    return _onto_surface(field, shadow.points[edge][from_mouth[edge].argmax()])
+    return _onto_surface(field, shadow.points[edge][from_mouth[edge].argmax()][None])[0]
 
 
 def _symphysis(surface: Points, other: Points, rows: Points) -> tuple[Points, Points]:

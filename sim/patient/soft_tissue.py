@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -15,6 +16,8 @@ Points = NDArray[np.float64]
 STEP_MM = 2.5
 SKIN_MM = 2.0
 AIR_HU = -1000.0
+_SKIN_HU = 15.0
+_CLEAR_MM = 2.5  # beyond the skin
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,15 +29,44 @@ class SoftTissue:
     inner_hu: Field
     fat_hu: Field
 
-    def hu(self, axes: Axes) -> tuple[Array, Array]:
-        """HU (X, Y, Z) of a box, and mm beneath the skin."""
-        at = (axes.x, axes.y, axes.z)
-        depth = self.depth.on_axes(*at)
-        share = np.clip((depth - self.fat.on_axes(*at)) / 1.5 + 0.5, 0, 1)  # of muscle and what lies within
-        hu = share * self.inner_hu.on_axes(*at) + (1 - share) * self.fat_hu.on_axes(*at)
-        hu[depth < SKIN_MM] = 15
-        hu[depth < 0] = AIR_HU
-        return hu, depth
+    def fill_in(self, axes: Axes, hu: Array, filled: Array) -> NDArray[np.bool_]:
+        """Add soft tissue to the HU (Z, Y, X) of bone, `filled` of each voxel; returns which voxels (Z, Y, X) are air.
+
+        These lie clear of the skin, so that no blur of it reaches them.
+        """
+        fields = (self.depth, self.fat, self.inner_hu, self.fat_hu)  # on one grid
+        values = np.stack([np.ascontiguousarray(field.values.T) for field in fields])
+        i, u, j, v, k, w = self.depth.places(axes.x, axes.y, axes.z)
+        air = np.empty(hu.shape, bool)
+        _fill_in(values, k, w, j, v, i, u, filled, hu, air)
+        return air
+
+
+@nb.njit(cache=True, parallel=True)
+def _fill_in(values, k, w, j, v, i, u, filled, hu, air):  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
+    """See `SoftTissue.fill_in`. `values` (4, Z, Y, X) holds depth, fat, HU within, HU of the fat.
+
+    Voxels lie between nodes k and k + 1 along z, at the share w of the way, and so on for the other axes.
+    """
+    half, skin, beyond = np.float32(0.5), np.float32(SKIN_MM), np.float32(-_CLEAR_MM)
+    for z in nb.prange(len(k)):
+        planes = values[:, k[z]] + w[z] * (values[:, k[z] + 1] - values[:, k[z]])
+        for y in range(len(j)):
+            depths, fats, inners, fat_hus = planes[:, j[y]] + v[y] * (planes[:, j[y] + 1] - planes[:, j[y]])
+            for x in range(len(i)):
+                n, share = i[x], u[x]
+                depth = depths[n] + share * (depths[n + 1] - depths[n])
+                soft = np.float32(AIR_HU)
+                if depth >= skin:
+                    fat = fats[n] + share * (fats[n + 1] - fats[n])
+                    inner = inners[n] + share * (inners[n + 1] - inners[n])
+                    fat_hu = fat_hus[n] + share * (fat_hus[n + 1] - fat_hus[n])
+                    muscle = min(max((depth - fat) / np.float32(1.5) + half, np.float32(0)), np.float32(1))
+                    soft = muscle * inner + (1 - muscle) * fat_hu
+                elif depth >= 0:
+                    soft = np.float32(_SKIN_HU)
+                hu[z, y, x] += (1 - filled[z, y, x]) * soft
+                air[z, y, x] = depth < beyond
 
 
 def _noise(rng: np.random.Generator, axes: Axes, sigma_mm: float) -> Array:

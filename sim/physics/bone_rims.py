@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+
+from sim.smoothing import gaussian_filter
 
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -19,7 +20,7 @@ def bone_opacities(moving: Mask, resting: Mask, spacing_zyx: Matrix) -> tuple[Ar
     The masks are [z, y, x], as is `spacing_zyx` in mm.
     """
     near_moving, near_resting = (
-        ndimage.gaussian_filter(mask.astype(np.float32), RIM_MM / spacing_zyx, truncate=3) for mask in (moving, resting)
+        gaussian_filter(mask.astype(np.float32), RIM_MM / spacing_zyx, truncate=3) for mask in (moving, resting)
     )
 
     def opacity(mask: Mask, own: Array, foreign: Array) -> Array:

@@ -8,7 +8,6 @@ import math
 import cv2
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -16,6 +15,7 @@ from femoreg_torch.geometry import Camera
 
 _FULL_SCALE = 65535
 _PATTERN_SEED = 20_200_101  # of the gain pattern: every image of a detector shows the same one
+_BLUR_ENDS = 4.0  # standard deviations from the middle of a blur to its end
 
 
 def record_quanta(energy: Tensor, photons: float, blur_sigma_px: float, generator: torch.Generator) -> Tensor:
@@ -65,7 +65,10 @@ def blur(image: Tensor, sigma_px: float) -> Tensor:
     """Gaussian blur (H, W) that keeps the mean of the image (mirrored border)."""
     if sigma_px == 0:
         return image.clone()
-    return torch.from_numpy(ndimage.gaussian_filter(image.numpy(), sigma_px, mode="reflect"))
+    half = int(_BLUR_ENDS * sigma_px + 0.5)
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma_px) ** 2)
+    kernel /= kernel.sum()
+    return torch.from_numpy(cv2.sepFilter2D(image.numpy(), cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REFLECT))
 
 
 def gain_pattern(shape: tuple[int, int], spread: float) -> Tensor:

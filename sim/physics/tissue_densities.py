@@ -12,13 +12,13 @@ from collections.abc import Sequence
 import numba as nb
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.volume import Volume, crop
 from femoreg_torch.volume.labels import label_box
 from sim.physics.bone_rims import RIM_MM, bone_opacities
 from sim.physics.materials import WATER_PER_BONE, tissue_densities
+from sim.smoothing import gaussian_filter
 
 COARSE_MM = 1.5  # about the voxels of the filled density
 _BONE_HU = 200.0  # denser voxels count as bone also where nothing is labelled
@@ -33,16 +33,9 @@ def separate(
     label map lacks one of the bones.
     """
     factor = max(1, round(COARSE_MM / min(ct.spacing_mm)))
-    ct, labels = _whole_blocks(ct, factor), _whole_blocks(labels, factor)
     filled, bone, names = _densities(ct, labels, factor)
     moving = [_cut_out(bone, names, ids) for ids in movable]
     return filled, bone, moving, Volume(_middles(labels.data, factor), filled.lps_from_index)
-
-
-def _whole_blocks(volume: Volume, factor: int) -> Volume:
-    """The volume without what fills no whole block of `factor` voxels along each axis at the far faces."""
-    z, y, x = (n // factor * factor for n in volume.data.shape)
-    return volume if (z, y, x) == tuple(volume.data.shape) else crop(volume, (0, 0, 0), (x, y, z))
 
 
 def _coarse_affine(volume: Volume, factor: int) -> Tensor:
@@ -53,19 +46,20 @@ def _coarse_affine(volume: Volume, factor: int) -> Tensor:
 
 
 def _middles(data: Tensor, factor: int) -> Tensor:
-    return data[factor // 2 :: factor, factor // 2 :: factor, factor // 2 :: factor].contiguous()
+    z, y, x = (slice(factor // 2, n // factor * factor, factor) for n in data.shape)
+    return data[z, y, x].contiguous()
 
 
 def _densities(ct: Volume, labels: Volume, factor: int) -> tuple[Volume, Volume, Volume]:
     """The filled density on blocks of `factor` voxels, the density of bone on the CT's voxels, cropped, and its labels.
 
     Bone is what is labelled or dense, with its partial-volume rim. Elsewhere all is soft tissue: what noise lifts above
-    the HU of muscle there is no bone.
+    the HU of muscle there is no bone. What fills no whole block at the far faces is left out.
     """
     hu, known = ct.data.numpy(), np.zeros([n // factor for n in ct.data.shape], np.float32)
     _mark_bone(hu, labels.data.numpy(), np.float32(_BONE_HU), factor, known)
     sigma = RIM_MM / factor / np.array(ct.spacing_mm[::-1])
-    near = ndimage.gaussian_filter(known, sigma, truncate=3)
+    near = gaussian_filter(known, sigma, truncate=3)
     opacity = np.maximum(np.clip(near / np.float32(0.15), 0, 1), known)
     spans = [np.flatnonzero((opacity > 0).any(axes)) for axes in ((1, 2), (0, 2), (0, 1))]
     first, end = ([int(span[at]) for span in spans] for at in (0, -1))
@@ -104,9 +98,15 @@ def _split(  # type: ignore[no-untyped-def]  # pragma: no cover (compiled)
     """
     depth, height, width = filled.shape
     for k in nb.prange(depth):
+        around = np.empty(width, np.float32)
         for j in range(height):
+            around[:] = 0  # the highest opacity of the row and its eight neighbours
+            for p in range(max(k - 1, 0), min(k + 2, depth)):
+                for q in range(max(j - 1, 0), min(j + 2, height)):
+                    for i in range(width):
+                        around[i] = max(around[i], opacity[p, q, i])
             for i in range(width):
-                near = opacity[max(k - 1, 0) : k + 2, max(j - 1, 0) : j + 2, max(i - 1, 0) : i + 2].max() > 0
+                near = around[i] > 0 or around[max(i - 1, 0)] > 0 or around[min(i + 1, width - 1)] > 0
                 mean = 0.0
                 for z in range(k * factor, (k + 1) * factor):
                     for y in range(j * factor, (j + 1) * factor):

@@ -15,7 +15,7 @@ from femoreg_torch.case.femoroplasty import ANATOMY_IMAGES, DEVICE_IMAGES, with_
 from femoreg_torch.case.model import Side
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import write_image
-from femoreg_torch.volume import Volume, label_box_centre, read_ct, read_labels, read_mesh
+from femoreg_torch.volume import Volume, label_box_centre, read_ct, read_label_map, read_labels, read_mesh
 from sim.patient import Patient, make_patient, make_scans, write_patient
 from sim.theatre.images import ViewImages, simulate_images
 from sim.theatre.metal import metal_in_beam
@@ -83,6 +83,11 @@ def write_procedural_simulation(
         _write_simulation(patient, out, seed, side, config, report, lambda: (imaged.ct, imaged.labels), patient_seed)
 
 
+def _case_scan(known: Preoperative) -> tuple[Volume, Volume]:
+    ct = read_ct(known.ct_path)
+    return ct, read_labels(known.labels_path, ct)
+
+
 def _read_pair(folder: Path) -> tuple[Volume, Volume]:
     ct = read_ct(folder / "ct.nii.gz")
     return ct, read_labels(folder / "labels.nii.gz", ct)
@@ -105,12 +110,9 @@ def _write_simulation(
         known = copied(read_preoperative(patient, side, seed, settings, folder / "device.stl"), folder)
         mesh = read_mesh(known.device.model.path)
         procedure = draw_procedure(known, mesh, settings.acquisition, generator)
-        ct = read_ct(known.ct_path)
-        labels = read_labels(known.labels_path, ct)
+        ct, labels = _case_scan(known) if imaged is None else imaged()
         if imaged is not None:
-            finer_ct, finer_labels = imaged()
-            check_same_patient(labels, finer_labels, known.femur)
-            ct, labels = finer_ct, finer_labels
+            check_same_patient(read_label_map(known.labels_path), labels, known.femur)
         images = simulate_images(
             ct,
             labels,

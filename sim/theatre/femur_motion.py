@@ -19,6 +19,7 @@ from torch import Tensor
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume import Volume
 from sim.physics.bone_rims import bone_opacities
+from sim.smoothing import gaussian_filter
 
 _FALL_OFF_MM = 30.0  # distance from the femur over which the soft tissue comes to rest
 _MARGIN_MM = _FALL_OFF_MM + 2.0
@@ -58,11 +59,14 @@ def rotate_femur(ct: Volume, labels: Volume, femur: tuple[int, ...], rotation: T
     femur_alpha, rest_alpha = bone_opacities(moving, resting, box.spacing_zyx)
     matrix, offset = _index_turn(box, turn, centre)
     moved_alpha = ndimage.affine_transform(femur_alpha, matrix, offset, order=1, mode="nearest")
-    moved_femur = ndimage.affine_transform(before, matrix, offset, order=3, mode="nearest")
-    np.clip(moved_femur, before.min(), before.max(), out=moved_femur)
 
     after = _bent_soft_tissue(before, np.maximum(femur_alpha, rest_alpha), moved_alpha, box, turn, centre)
-    after += moved_alpha * (moved_femur - after)
+    part = _where(moved_alpha > 0)
+    start = matrix @ [axis.start for axis in part] + offset
+    size = after[part].shape
+    moved_femur = ndimage.affine_transform(before, matrix, start, output_shape=size, order=3, mode="nearest")
+    np.clip(moved_femur, before.min(), before.max(), out=moved_femur)
+    after[part] += moved_alpha[part] * (moved_femur - after[part])
     after += rest_alpha * (before - after)
     after[resting] = before[resting]
 
@@ -90,6 +94,13 @@ def _box_around(is_femur: Mask, ct: Volume, turn: Matrix, centre: Matrix) -> _Bo
     return _Box((z, y, x), shifted, np.array(ct.spacing_mm)[::-1])
 
 
+def _where(mask: Mask) -> tuple[slice, slice, slice]:
+    """The box of what is set."""
+    spans = [np.flatnonzero(mask.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+    z, y, x = (slice(int(span[0]), int(span[-1]) + 1) for span in spans)
+    return z, y, x
+
+
 def _index_turn(box: _Box, turn: Matrix, centre: Matrix) -> tuple[Matrix, Matrix]:
     """Matrix and offset that take a [z, y, x] index after the turn to the index that it came from."""
     axes, origin = box.lps_from_index[:3, :3], box.lps_from_index[:3, 3]
@@ -108,7 +119,7 @@ def _bent_soft_tissue(before: Array, bone: Array, moved_femur: Array, box: _Box,
     steps = (np.array(before.shape) - 1) / (np.array(shape) - 1)  # voxels per coarse one
     far = _resized(moved_femur, shape) <= 0.5
     distance = ndimage.distance_transform_edt(far, sampling=steps * box.spacing_zyx)
-    weight = ndimage.gaussian_filter(np.clip(1 - distance / _FALL_OFF_MM, 0, 1) ** 2, 1.5)
+    weight = gaussian_filter((np.clip(1 - distance / _FALL_OFF_MM, 0, 1) ** 2).astype(np.float32), 1.5)
 
     axes, origin = box.lps_from_index[:3, :3], box.lps_from_index[:3, 3]
     index = np.indices(shape).reshape(3, -1).T * steps
@@ -133,8 +144,8 @@ def _fill(before: Array, bone: Array, factor: tuple[float, ...]) -> Array:
     fill, known = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for width_mm in (3.0, 9.0, 27.0):
         sigma = width_mm / _COARSE_MM
-        weight = ndimage.gaussian_filter(share, sigma)
-        average = ndimage.gaussian_filter(values, sigma) / np.maximum(weight, 1e-6)
+        weight = gaussian_filter(share, sigma)
+        average = gaussian_filter(values, sigma) / np.maximum(weight, 1e-6)
         trust = np.clip(weight / 0.1, 0, 1) * (1 - known)
         fill += trust * average
         known += trust

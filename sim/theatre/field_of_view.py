@@ -32,6 +32,8 @@ def field_of_view(volume: Volume, camera_from_lps: Sequence[Tensor] | Tensor, ca
     high = (points.amax(0) + room).ceil().int().tolist()
     part = crop(volume, (low[0], low[1], low[2]), (high[0] + 1, high[1] + 1, high[2] + 1))
     below, above = max(0, -low[2]), max(0, high[2] + 1 - volume.data.shape[0])
+    if not below and not above:
+        return part
     slices = [part.data[:1].expand(below, -1, -1), part.data, part.data[-1:].expand(above, -1, -1)]
     affine = part.lps_from_index.clone()
     affine[:3, 3] -= below * affine[:3, 2]

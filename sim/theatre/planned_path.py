@@ -1,5 +1,6 @@
 """A drill path planned by rule: from the lateral cortex along the femoral neck into the centre of the head."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,7 +22,7 @@ def neck_axis_entry(labels: Volume, femur: tuple[int, ...], head_centre: Tensor)
     The axis runs from the centre of the head (3,) through the centroid of the femur in a spherical shell that holds
     only neck; the entry point is the last point of that ray in the femur. Raises `InputError` if the shell is empty.
     """
-    mask = torch.isin(labels.data, torch.tensor(femur, dtype=labels.data.dtype))
+    mask = torch.from_numpy(np.isin(labels.data.numpy(), femur))
     index = mask.nonzero().flip(1).to(torch.float64)  # (N, 3), x y z
     affine = labels.lps_from_index
     points = index @ affine[:3, :3].T + affine[:3, 3]

@@ -42,7 +42,8 @@ def take_apart(
 
 def _occupied(moving: Volume, labels: Volume, femur: tuple[int, ...], turn: Tensor) -> Tensor:
     """Share (Z, Y, X) of each voxel of the femur that, once turned, lies in another bone: it is left out."""
-    others = (labels.data > 0) & ~torch.isin(labels.data, torch.tensor(femur, dtype=labels.data.dtype))
+    names = labels.data.numpy()
+    others = (names > 0) & ~np.isin(names, femur)
     affine = torch.linalg.inv(labels.lps_from_index) @ turn @ moving.lps_from_index
     depth, height, width = moving.data.shape
     last = torch.tensor([width, height, depth], dtype=torch.float64) - 1
@@ -50,7 +51,7 @@ def _occupied(moving: Volume, labels: Volume, femur: tuple[int, ...], turn: Tens
     scale = torch.diag(last / (torch.tensor(counts, dtype=torch.float64) - 1))
     matrix = (affine[:3, :3] @ scale).flip(0, 1).numpy()
     coarse = ndimage.affine_transform(
-        others.numpy().astype(np.float32), matrix, affine[:3, 3].flip(0).numpy(), tuple(counts[::-1]), order=1
+        others.astype(np.float32), matrix, affine[:3, 3].flip(0).numpy(), tuple(counts[::-1]), order=1
     )
     size = (depth, height, width)
     return F.interpolate(torch.from_numpy(coarse)[None, None], size=size, mode="trilinear", align_corners=True)[0, 0]

@@ -30,7 +30,8 @@ def make_label_patient(labels: Volume, bones: LabelTable, seed: int, spacing_mm:
     drawing_seed, tissue_seed, noise_seed, *bone_seeds = np.random.SeedSequence(seed).spawn(3 + len(LABEL_IDS))
     parameters = draw_parameters(np.random.default_rng(drawing_seed))
     seeds = [seed for bone, seed in zip(LABEL_IDS, bone_seeds, strict=True) if bone in skeleton.bones]
-    ct, numbers = scan_skeleton(skeleton, parameters, bottom_mm, [tissue_seed, noise_seed, *seeds], spacing_mm)
+    seeds = [tissue_seed, noise_seed, *seeds]
+    [(ct, numbers)] = scan_skeleton(skeleton, parameters, bottom_mm, seeds, [spacing_mm])
 
     def moved(volume: Volume) -> Volume:
         affine = volume.lps_from_index.clone()

@@ -45,5 +45,5 @@ def make_scans(seed: int, spacings_mm: Sequence[float]) -> list[Patient]:
     landmarks = find_landmarks(skeleton)
     points = {name: torch.from_numpy(landmarks[name].copy()) for name in HIP.landmark_names}
     numbers = {k: float(v) for k, v in asdict(parameters).items()}
-    scans = [scan_skeleton(skeleton, parameters, -BELOW_MM, scan_seeds, spacing_mm) for spacing_mm in spacings_mm]
+    scans = scan_skeleton(skeleton, parameters, -BELOW_MM, scan_seeds, spacings_mm)
     return [Patient(ct, labels, points, numbers) for ct, labels in scans]

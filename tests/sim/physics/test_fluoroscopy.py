@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from torch.testing import assert_close
 
 from femoreg_torch.geometry import centred_camera, rigid
@@ -171,3 +172,10 @@ def test_bone_is_dark(model):
     areal["bone"][:, 8:] = 2
     image = fluoroscopy(areal, centred_camera(1000.0, (2.0, 2.0), (16, 16)), model, torch.Generator().manual_seed(0))
     assert image[:, 8:].float().mean() < 0.8 * image[:, :8].float().mean()
+
+
+@pytest.mark.parametrize("sigma_px", [0.4, 0.8, 3.0])
+def test_the_blur_is_the_gaussian_filter_of_scipy(sigma_px):
+    image = 1e4 * torch.rand(37, 52, generator=torch.Generator().manual_seed(0))
+    expected = ndimage.gaussian_filter(image.numpy(), sigma_px)
+    assert np.abs(blur(image, sigma_px).numpy() - expected).max() < 1e-2
