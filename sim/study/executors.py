@@ -61,7 +61,7 @@ class OnCluster:
     def __call__(self, work: Work, store: Store, todo: Sequence[Batch], done: Callable[[Batch], None]) -> None:
         """A batch whose worker dies is given to another; one that ends several of them is given up.
 
-        Raises `InputError` if the scheduler does not answer, or its workers run several tasks at a time.
+        Raises `InputError` if the scheduler does not answer or goes away, or its workers run several tasks at a time.
         """
         from distributed import Client, KilledWorker, as_completed
 
@@ -78,6 +78,11 @@ class OnCluster:
             finished = as_completed(waiting, loop=client.loop)
             for future in finished:
                 whole, batch = waiting.pop(future)
+                if future.cancelled():
+                    raise InputError(
+                        f"--scheduler {self.address}: has gone. The runs that are done are kept: give the same command "
+                        "again once it is there."
+                    )
                 failure = future.exception()
                 if isinstance(failure, KilledWorker):
                     rest = give_up(store, batch)

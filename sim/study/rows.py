@@ -14,14 +14,15 @@ TABLE_NAME = "runs.parquet"
 _AXES = ("is", "lr", "ap")
 _PER_AXIS = (1, 0, 2)  # errors are told along IS, LR and AP, deviations along the camera's x, y and z
 _DIFFERS = ("seconds_", "host", "version_")  # what may differ between two runs of the same study
+_HEAD = ("study", "condition", "number", "patient", "kind", "side", "seed", "preset", "code", "settings")
+_LAST = ("evaluations_", "seconds_", "version_", "host")  # beginnings of the columns that stand at the end
 
 Row = dict[str, Any]
 
 
 def rows_of(record: Record) -> list[Row]:
     """The row of a run; of a closed loop, one for each round."""
-    head: Row = {key: record[key] for key in ("study", "condition", "number", "patient", "kind", "side", "seed")}
-    head |= {key: record[key] for key in ("preset", "code", "settings")}
+    head: Row = {key: record[key] for key in _HEAD}
     head |= {f"varied_{key}": value for key, value in record["varied"].items()}
     tail = {"seconds_run": record["run_s"]} if "run_s" in record else {}
     tail |= {f"version_{key}": value for key, value in record["versions"].items()} | {"host": record["host"]}
@@ -48,8 +49,16 @@ def _of_round(record: Record) -> Row:
 def table_of(records: Sequence[Record]) -> pa.Table:
     """All rows, in the order of the records; a column for all that any of them tells."""
     rows = [row for record in records for row in rows_of(record)]
-    names = list(dict.fromkeys(name for row in rows for name in row))
+    names = sorted(dict.fromkeys(name for row in rows for name in row), key=_place)
     return pa.table({name: _column([row.get(name) for row in rows]) for name in names})
+
+
+def _place(name: str) -> int:
+    """What is told of a run, what was varied, results, costs, versions and host; in each as the rows have them."""
+    if name in _HEAD:
+        return 0
+    last = (place for place, start in enumerate(_LAST, 3) if name.startswith(start))
+    return 1 if name.startswith("varied_") else next(last, 2)
 
 
 def _column(values: list[Any]) -> pa.Array:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from coarse import PROCEDURE, coarse_simulation, coarse_stores
+from coarse import PROCEDURE, SIMULATION, stores_in
 from femoreg_torch.configs import load_preset
 from torch import Tensor
 
@@ -44,35 +44,24 @@ def registered(change: Callable[[Poses], Poses] = lambda poses: poses, quality: 
     return register
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("loop")
-    coarse_stores(root)
-    coarse_simulation(root)
-    return root
-
-
 def run(root: Path, name: str, loop: ClosedLoop, register: Register) -> list[dict[str, Any]]:
-    from sim.study.cases import Stores
-
-    stores = Stores(root / "cases", root / "patients", root / "data")
     starts.clear()
-    base = load_preset("simulation", root / "coarse.yaml")
-    body = Body(PROCEDURE, stores, root / "body")
-    record = run_rounds(loop, Condition("plain"), PROCEDURE, base, body, root / name, register)
+    base = load_preset("simulation", root / SIMULATION)
+    body = Body(PROCEDURE, stores_in(root), root / "loop_body")
+    record = run_rounds(loop, Condition("plain"), PROCEDURE, base, body, root / "loop" / name, register)
     rounds: list[dict[str, Any]] = record["rounds"]
     return rounds
 
 
-def test_the_truth_and_an_exact_robot_bring_the_guide_onto_the_plan(root: Path) -> None:
-    first, second = run(root, "exact", ClosedLoop(2, 0.0, 0.0), registered())
+def test_the_truth_and_an_exact_robot_bring_the_guide_onto_the_plan(coarse_root: Path) -> None:
+    first, second = run(coarse_root, "exact", ClosedLoop(2, 0.0, 0.0), registered())
     assert first["before_mm"] > 50  # the device starts in front of the patient
     assert first["left_mm"] == pytest.approx(0, abs=1e-6)
     assert first["left_deg"] == pytest.approx(0, abs=1e-4)
     assert (first["round"], second["round"]) == (1, 2)
     assert second["before_mm"] == pytest.approx(0, abs=1e-5)  # as the files of the second round tell it
 
-    one, two = (read_case(root / "exact" / f"round{number}") for number in (1, 2))
+    one, two = (read_case(coarse_root / "loop" / "exact" / f"round{number}") for number in (1, 2))
     assert one.truth is not None
     assert two.truth is not None
     # the patient lies still: the hip is turned as before, and the C-arm has moved by some centimetres, hardly turned
@@ -97,8 +86,8 @@ def test_the_truth_and_an_exact_robot_bring_the_guide_onto_the_plan(root: Path) 
     torch.testing.assert_close(nominal, start["device"], atol=1e-6, rtol=0)
 
 
-def test_the_device_is_seen_at_the_bone(root: Path) -> None:
-    case = read_case(root / "exact" / "round2")
+def test_the_device_is_seen_at_the_bone(coarse_root: Path) -> None:
+    case = read_case(coarse_root / "loop" / "exact" / "round2")
     assert case.truth is not None
     points = case.objects["device"].points
     for view, images in enumerate(case.views):
@@ -112,11 +101,11 @@ def test_the_device_is_seen_at_the_bone(root: Path) -> None:
         assert darker[row - 2 : row + 3, column - 2 : column + 3].max() == 1  # the middle of the guide
 
 
-def test_a_robot_leaves_its_own_error_and_a_registration_its_own(root: Path) -> None:
-    (only,) = run(root, "robot", ClosedLoop(1, 0.5, 1.0), registered())
+def test_a_robot_leaves_its_own_error_and_a_registration_its_own(coarse_root: Path) -> None:
+    (only,) = run(coarse_root, "robot", ClosedLoop(1, 0.5, 1.0), registered())
     assert 0.1 < only["left_mm"] < 4
     assert 0 < only["left_deg"] < 2
-    again = run(root, "again", ClosedLoop(1, 0.5, 1.0), registered())
+    again = run(coarse_root, "again", ClosedLoop(1, 0.5, 1.0), registered())
     assert again[0]["left_mm"] == only["left_mm"]
 
     def shifted(poses: Poses) -> Poses:
@@ -124,18 +113,18 @@ def test_a_robot_leaves_its_own_error_and_a_registration_its_own(root: Path) -> 
         device[:3, 3] += torch.tensor([0.0, 3.0, 4.0], dtype=torch.float64)
         return poses.with_object("device", device)
 
-    (off,) = run(root, "shifted", ClosedLoop(1, 0.0, 0.0), registered(shifted))
+    (off,) = run(coarse_root, "shifted", ClosedLoop(1, 0.0, 0.0), registered(shifted))
     assert off["left_mm"] == pytest.approx(5, abs=1e-5)
     assert off["left_deg"] == pytest.approx(0, abs=1e-4)
 
 
-def test_what_is_not_trusted_moves_no_robot(root: Path) -> None:
+def test_what_is_not_trusted_moves_no_robot(coarse_root: Path) -> None:
     doubtful = replace(TRUSTED, trusted=False, reason="the views disagree")
-    (only,) = run(root, "doubtful", ClosedLoop(2, 0.0, 0.0), registered(quality=doubtful))
+    (only,) = run(coarse_root, "doubtful", ClosedLoop(2, 0.0, 0.0), registered(quality=doubtful))
     assert only["left_mm"] == only["before_mm"] > 50
     assert only["trusted"] is False
     (refused,) = run(
-        root,
+        coarse_root,
         "refused",
         ClosedLoop(2, 0.0, 0.0),
         lambda *_: ({"refused": "dark", "trusted": False, "reasons": []}, None),

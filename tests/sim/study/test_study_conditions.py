@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from coarse import PROCEDURE, coarse_simulation, coarse_stores
+from coarse import PROCEDURE, SIMULATION, stores_in
 
 from femoreg_torch.case import read_case
 from femoreg_torch.case.femoroplasty import device_of
@@ -29,14 +29,14 @@ CONDITIONS = read_conditions("conditions")
 
 
 @pytest.fixture(scope="module")
-def stores(tmp_path_factory: pytest.TempPathFactory) -> Stores:
-    return coarse_stores(tmp_path_factory.mktemp("study"))
+def stores(coarse_root: Path) -> Stores:
+    return stores_in(coarse_root)
 
 
 @pytest.fixture(scope="module")
 def study(stores: Stores) -> Study:
     """That of the accuracy study, with 16 × 16 pixels of the C-arm in one."""
-    return replace(load_study("accuracy"), acquisition=str(coarse_simulation(stores.cases.parent)))
+    return replace(load_study("accuracy"), acquisition=str(stores.cases.parent / SIMULATION))
 
 
 @pytest.fixture(scope="module")

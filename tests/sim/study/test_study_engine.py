@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from multiprocessing import get_context
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pyarrow.compute as pc
@@ -117,6 +118,43 @@ def test_a_full_disk_is_told_in_one_line_and_the_study_goes_on_once_there_is_roo
     small_disk.extend([tmp_path] * 100)
     run_study(study(40, Cheap()), tmp_path, HERE)
     assert rows(tmp_path) == undisturbed
+
+
+def test_a_failure_on_a_disk_without_room_is_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Libraries that write images tell it as some error of theirs."""
+    full = SimpleNamespace(total=1, used=1, free=1000)
+    monkeypatch.setattr("sim.study.engine.shutil.disk_usage", lambda _: full)
+    with pytest.raises(InputError, match="No space left"):
+        run_study(study(9, Cheap(broken=("plain",))), tmp_path, HERE)
+    assert len(list((tmp_path / "runs").iterdir())) == 2  # those before the first that failed
+
+
+def test_an_interrupted_study_leaves_the_table_of_what_is_done(tmp_path: Path, undisturbed: list[Any]) -> None:
+    made: list[int] = []
+
+    def interrupt(done: int) -> None:
+        made.append(done)
+        if len(made) == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_study(study(40, Cheap()), tmp_path, HERE, progress=interrupt)
+    assert rows(tmp_path) == undisturbed[:5]
+    run_study(study(40, Cheap()), tmp_path, HERE)
+    assert rows(tmp_path) == undisturbed
+
+
+def test_the_table_is_renewed_along_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study_module, "_TABLE_S", 0.0)
+    monkeypatch.setattr(study_module, "_TABLE_SHARE", 1e9)
+    seen: list[int] = []
+
+    def look(_: int) -> None:
+        if (tmp_path / TABLE_NAME).exists():
+            seen.append(len(rows(tmp_path)))
+
+    run_study(study(5, Cheap()), tmp_path, HERE, progress=look)
+    assert seen == [1, 2, 3, 4]
 
 
 def test_a_run_that_fails_is_told_with_its_place_and_tried_again(tmp_path: Path) -> None:

@@ -114,3 +114,14 @@ def test_what_is_wrong_is_told(content: dict[str, Any], says: str, tmp_path: Pat
 def test_real_bones_that_are_not_there_are_told_before_anything_is_made(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--data: .*bmf.npz: there is no such file"):
         plan_study("paper", 1, tmp_path, tmp_path, False)
+
+
+def test_real_bones_that_are_there_are_every_second_patient(tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    for subject in load_protocol("paper").subjects:
+        (tmp_path / "meshes" / f"{subject}.npz").touch()
+    without, with_them = (plan_study("paper", 4, tmp_path, data, False).runs for data in (None, tmp_path))
+    assert [run.kind for run in without] == ["procedural"] * 4
+    assert [run.kind for run in with_them] == ["procedural", "real"] * 2
+    assert [run.procedure.patient for run in with_them] == ["10001", "bmf", "10003", "gias2"]
+    assert not {run.name for run in without} & {run.name for run in with_them}  # they do not mix

@@ -55,6 +55,13 @@ def test_the_columns_are_those_that_were_agreed_on(records: list[dict[str, Any]]
     assert wanted <= set(table.column_names)
 
 
+def test_a_first_run_that_tells_little_leaves_the_columns_in_their_order(records: list[dict[str, Any]]) -> None:
+    names = table_of([records[6] | {"varied": {}}, *records]).column_names
+    assert names[:12] == [*HEAD, "varied_dose", "status"]
+    assert names[-1] == "host"
+    assert names.index("pelvis_mm") < names.index("evaluations_pelvis_in_view_1") < names.index("seconds_run")
+
+
 def test_errors_are_named_and_signed_as_in_the_csv(records: list[dict[str, Any]]) -> None:
     for record, old in zip(records, rows_of_csv(records), strict=True):
         (row,) = rows_of(record)
