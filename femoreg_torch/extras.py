@@ -7,7 +7,11 @@ _EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
     "kornia": "train",
     "lightning": "train",
     "tensorboard": "train",
+    "dask": "study",
+    "distributed": "study",
     "joblib": "study",
+    "pandas": "study",
+    "pyarrow": "study",
     "matplotlib": "all",  # in both `train` and `study`
 }
 

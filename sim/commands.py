@@ -1,7 +1,7 @@
 """Commands of the simulated operating room: patients, procedures on them, labelled images, and the demo."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 
 def phantom(out: Path, *, seed: int = 1, side: Literal["left", "right"] = "left", spacing_mm: float = 1.0) -> None:
@@ -148,6 +148,78 @@ def labelled_images(
     with console.status(f"imaging {patient}"):
         write_labelled_images(patient, out, config, count, seed, name)
     console.print(f"{count} labelled images written to {out}")
+
+
+def study(
+    config: str,
+    *,
+    out: Path,
+    procedures: Annotated[int | None, "-n"] = None,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    data: Path | None = None,
+    keep_cases: bool = False,
+    reuse: bool = False,
+) -> int:
+    """Simulate and register many procedures under one or many conditions, and write one table of all runs.
+
+    Each run is kept in OUT/runs as soon as it is done. Started again after it was killed, the command goes on with the
+    runs that are missing; runs of other code are made anew, and runs of other settings stay beside them, out of the
+    table. A run that fails does not stop the others. The table is OUT/runs.parquet. Status 1 if a run failed.
+
+    Args:
+        config: Protocol in configs/study, or a YAML file: `paper`, `closed_loop`, `dose`, … (see docs/study.md).
+        out: Folder of the runs and of the table.
+        procedures: The first so many procedures; as many as the protocol says, if not given.
+        jobs: Procedures at the same time, on one core each; each needs some 3 GB of memory.
+        scheduler: Address of a Dask scheduler, whose workers then do the work in place of this machine.
+        data: Folder with meshes/SUBJECT.npz of real bones, for protocols that name `subjects`.
+        keep_cases: Keep the simulated case folders in OUT/cases, some 50 MB each.
+        reuse: Take runs that are there although the code has changed since.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from femoreg_torch.commands.status import AMISS, DONE
+    from femoreg_torch.errors import InputError
+    from sim.study.engine import Executor
+    from sim.study.executors import OnCluster, OnThisMachine
+    from sim.study.study import plan_study, run_study
+
+    if jobs < 1:
+        raise InputError(f"--jobs: at least 1 was expected, got {jobs}.")
+    console = Console()
+    with console.status("reading the protocol"):
+        plan = plan_study(config, procedures, out.resolve(), data, keep_cases)
+    executor: Executor = OnThisMachine(jobs) if scheduler is None else OnCluster(scheduler)
+    bar = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn())
+    with Progress(TextColumn("runs"), *bar, console=console, speed_estimate_period=3600) as progress:
+        task = progress.add_task("runs", total=len(plan.runs))
+
+        def begin(todo: int, kept: int, others: int) -> None:
+            progress.update(task, total=todo)
+            if kept:
+                console.print(f"{kept} of {kept + todo} runs are there already.")
+            if others:
+                console.print(
+                    f"{others} records of other settings or procedures stay in {out / 'runs'}, out of the table."
+                )
+
+        told = run_study(plan, out, executor, reuse, begin, lambda done: progress.advance(task, done))
+    counts = ", ".join(f"{count} {status}" for status, count in sorted(told.status.items()))
+    console.print(f"Simulated runs: {counts}; of those done, {told.flagged} are not trusted.")
+    if told.first_failure is not None:
+        console.print(f"[bold red]Failed[/], first of them: {escape(told.first_failure)}")
+    console.print(f"Table written to {told.table}.", markup=False)
+    return AMISS if told.first_failure is not None else DONE
 
 
 def demo(*, out: Path = Path("out/demo"), seed: int = 1, preset: str = "fast") -> None:

@@ -2,7 +2,8 @@
 
 A command is a plain typed function that an installed package names in the entry-point group
 `femoreg_torch.commands`; its Google docstring is its help. Parameters without a default that come before a `*` are
-positional (a `list[…]` takes one or more values), all others are options. Only the chosen command is imported.
+positional (a `list[…]` takes one or more values), all others are options; `Annotated[int, "-n"]` adds a short form.
+Only the chosen command is imported.
 """
 
 import ast
@@ -26,8 +27,8 @@ GROUP = "femoreg_torch.commands"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `femoreg` with these arguments (those of the process if None) and return its exit status.
 
-    0: done; 1: `doctor` found something amiss; 2: bad input, told in one line on stderr; 3: done, but not trusted;
-    130: interrupted. Whatever else goes wrong is a defect of this program and keeps its traceback.
+    0: done; 1: `doctor` found something amiss, or a run of a study failed; 2: bad input, told in one line on stderr;
+    3: done, but not trusted; 130: interrupted. Whatever else goes wrong is a defect and keeps its traceback.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands = {command.name: command for command in entry_points(group=GROUP)}
@@ -111,8 +112,10 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
     hints = get_type_hints(function)
     if "config" not in hints:
         parser.add_argument("--config", action="config", help="YAML file with options; the command line overrides it")
+    annotated = get_type_hints(function, include_extras=True)
     for parameter in inspect.signature(function).parameters.values():
         flags, settings = _argument(parameter, hints[parameter.name])
+        flags += getattr(annotated[parameter.name], "__metadata__", ())  # short forms, as in Annotated[int, "-n"]
         parser.add_argument(*flags, **settings, help=help_of.get(parameter.name))
     try:
         parsed = parser.parse_args(arguments)

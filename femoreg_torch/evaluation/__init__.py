@@ -1,6 +1,6 @@
 """Errors against the truth, the paper's figures beside them, overlays, the report and the replay."""
 
-from femoreg_torch.evaluation.errors import ReferencePoints, errors, reference_points
+from femoreg_torch.evaluation.errors import ReferencePoints, errors, path_displacements, reference_points
 from femoreg_torch.evaluation.overlay import draw_edges, overlay_figure
 from femoreg_torch.evaluation.replay import write_replay
 from femoreg_torch.evaluation.run import EVALUATION_NAMES, evaluate, write_report
@@ -16,6 +16,7 @@ __all__ = [
     "errors",
     "evaluate",
     "overlay_figure",
+    "path_displacements",
     "reference_points",
     "write_replay",
     "write_report",

@@ -73,6 +73,21 @@ def errors(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, 
     return rows | _path_errors(there, here, points)
 
 
+def path_displacements(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, Tensor]:
+    """Estimated minus true place (3,) of `entry_point` and `tip`, mm along IS, LR and AP, where both have a pose."""
+    found = {}
+    if points.plan is not None:
+        found["entry_point"] = points.plan.object, points.plan.entry_point
+        if points.plan.tool is not None and points.guide is not None:
+            found["tip"] = points.plan.tool, points.guide[1]
+    there, here = truth.camera1_from, estimate.camera1_from
+    return {
+        key: PAPER_FROM_CAMERA @ _displacement(there[name], here[name], point)
+        for key, (name, point) in found.items()
+        if name in there and name in here
+    }
+
+
 def _path_errors(truth: dict[str, Tensor], estimate: dict[str, Tensor], points: ReferencePoints) -> dict[str, float]:
     plan = points.plan
     if plan is None or plan.object not in truth or plan.object not in estimate:

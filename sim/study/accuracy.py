@@ -4,18 +4,17 @@ import csv
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
 from joblib import Parallel, delayed, parallel_config
 
-import femoreg_torch
 from femoreg_torch.files import read_json, temporary_file, write_json
 from femoreg_torch.registration import Plan
 from sim.study import figures
 from sim.study.cases import Stores, make_case_alone
+from sim.study.code import library
 from sim.study.page import machine, number, table, write_section
 from sim.study.procedures import Procedure, Study
 from sim.study.summary import (
@@ -95,17 +94,7 @@ def _is_kept(runs: Path, procedure: Procedure, code: str | None) -> bool:
 
 def fingerprint(plan: Plan, views: int | None) -> str:
     """Of the library's code, the network's weights, plan and views: what a record depends on beside its case."""
-    return hashlib.sha256(repr((_library(), plan, views)).encode()).hexdigest()[:16]
-
-
-@cache
-def _library() -> str:
-    """Digest of code and weights at the first call: what this process has loaded, whatever is edited later."""
-    digest = hashlib.sha256()
-    root = Path(femoreg_torch.__file__).parent
-    for path in sorted(root.rglob("*.py")) + sorted((root.parent / "models").rglob("*.safetensors")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
+    return hashlib.sha256(repr((library(), plan, views)).encode()).hexdigest()[:16]
 
 
 def line_of(record: Record) -> str:

@@ -1,25 +1,23 @@
 """How far off the pelvis may start: success of the first view's stages against rotation, depth and shift."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.nn import functional as F
 
 from femoreg_torch.case import read_case
 from femoreg_torch.case.femoroplasty import PELVIS
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import errors, reference_points
 from femoreg_torch.files import write_json
-from femoreg_torch.geometry import about_point, exp_so3, rigid, transform_points
 from femoreg_torch.registration import Plan, prepare_scene, run_plan
 from femoreg_torch.registration.plan import Stage
 from sim.study import figures
 from sim.study.page import machine, table, write_section
+from sim.study.starts import Offset, displaced
 
 SUCCESS_MM, SUCCESS_DEG = 10.0, 2.0  # one view leaves millimetres of depth; the stages after it settle them
 FULL = {"rotation": 30.0, "depth": 100.0, "lateral": 40.0}  # degrees, mm, mm
@@ -32,35 +30,10 @@ AXIS_LABELS = {
 }
 
 
-@dataclass(frozen=True)
-class Offset:
-    """How far a start lies from the truth."""
-
-    rotation_deg: float
-    depth_mm: float
-    lateral_mm: float
-
-
 def offset(sweep: str, share: float) -> Offset:
     """The offset of one sweep at a share of its full size."""
     size = {name: share * full if sweep in (name, "jointly") else 0.0 for name, full in FULL.items()}
     return Offset(size["rotation"], size["depth"], size["lateral"])
-
-
-def displaced(camera1_from_pelvis: Tensor, centre: Tensor, by: Offset, generator: torch.Generator) -> Tensor:
-    """A start pose (4, 4): turned about `centre` (3,) of the pelvis (mm, LPS) and shifted, in camera axes.
-
-    The axis of rotation is uniform on the sphere, the shift's direction uniform in the image plane, the change of depth
-    as often towards the source as away from it.
-    """
-    axis = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
-    angle, sign = torch.rand(2, generator=generator, dtype=torch.float64)
-    along = 2 * torch.pi * angle
-    depth = by.depth_mm * (1.0 if sign < 0.5 else -1.0)
-    shift = torch.stack([by.lateral_mm * along.cos(), by.lateral_mm * along.sin(), torch.as_tensor(depth).double()])
-    turn = rigid(exp_so3(torch.deg2rad(torch.tensor(by.rotation_deg, dtype=torch.float64)) * axis))
-    middle = transform_points(camera1_from_pelvis, centre[None])[0]
-    return rigid(translation=shift) @ about_point(turn, middle) @ camera1_from_pelvis
 
 
 def first_stages(plan: Plan) -> Plan:

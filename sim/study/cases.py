@@ -61,14 +61,12 @@ def make_case(procedure: Procedure, study: Study, stores: Stores, report: Callab
     if procedure.procedural:
         spacings = (REGISTERED_MM, PROCEDURAL_IMAGED_MM)
         patient = int(procedure.patient)
-        write_procedural_simulation(
-            folder, patient, procedure.seed, procedure.side, study.acquisition, report, spacings
-        )
+        write_procedural_simulation(folder, patient, procedure.seed, procedure.hip, study.acquisition, report, spacings)
     else:
         patient_folder, finer = (
             subject_folder(procedure.patient, mm, stores) for mm in (REGISTERED_MM, REAL_IMAGED_MM)
         )
-        write_simulation(patient_folder, folder, procedure.seed, procedure.side, study.acquisition, report, finer)
+        write_simulation(patient_folder, folder, procedure.seed, procedure.hip, study.acquisition, report, finer)
     write_json(folder / _ORIGIN, origin)
 
 

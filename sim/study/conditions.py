@@ -5,8 +5,6 @@ by view, so that each further condition costs a few seconds. Remove the folder o
 integrals, have changed.
 """
 
-import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -28,6 +26,7 @@ from femoreg_torch.settings import read_record
 from femoreg_torch.volume import Volume, read_ct, read_labels, read_mesh
 from sim.patient import Patient, make_scans
 from sim.study.cases import PROCEDURAL_IMAGED_MM, REAL_IMAGED_MM, REGISTERED_MM, Stores, subject_folder
+from sim.study.code import digest
 from sim.study.faults import FAULTS, read_case_file, write_case_file
 from sim.study.imperfect_ct import ImperfectCt, spoil_ct
 from sim.study.procedures import Procedure, Study
@@ -65,6 +64,7 @@ class Condition:
     acquisition: dict[str, Any] = field(default_factory=dict)
     xray: dict[str, Any] = field(default_factory=dict)
     told: Told = field(default_factory=Told)
+    carm: str | None = None  # a preset or YAML file of another C-arm
 
 
 @dataclass(frozen=True)
@@ -89,15 +89,17 @@ def read_conditions(name: str | Path, only: Sequence[str] = ()) -> list[Conditio
     known = read_record(_Conditions, load_preset("study", name), f"conditions {name}").conditions
     names = [condition.name for condition in known]
     for condition in known:
-        if condition.told.fault not in (None, *FAULTS):
-            raise InputError(
-                f"conditions {name}, {condition.name}: there is no fault {condition.told.fault!r}; there are: "
-                f"{', '.join(FAULTS)}."
-            )
+        check_faults(condition, f"conditions {name}, {condition.name}")
     for wanted in only:
         if wanted not in names:
             raise InputError(f"conditions {name}: there is no {wanted!r}; there are: {', '.join(names)}.")
     return [condition for condition in known if not only or condition.name in only]
+
+
+def check_faults(condition: Condition, where: str) -> None:
+    """Raises `InputError` if the cases of a condition are to be wrong in a way that is not known."""
+    if condition.told.fault not in (None, *FAULTS):
+        raise InputError(f"{where}: there is no fault {condition.told.fault!r}; there are: {', '.join(FAULTS)}.")
 
 
 def make_conditions(
@@ -126,41 +128,44 @@ def image_procedure(
     report: Callable[[str], None],
 ) -> None:
     """Make the cases of a procedure under all conditions, but for those that are there."""
-    body = _Body(procedure, stores, out.bodies / procedure.name)
+    body = Body(procedure, stores, out.bodies / procedure.name)
+    base = load_preset("simulation", study.acquisition)
     for condition in conditions:
-        if not _ready(condition, procedure, study, out):
+        if not _ready(condition, procedure, base, out):
             report(condition.name)
-            _make_case(condition, procedure, study, body, out.case(condition, procedure))
+            make_case(condition, procedure, base, body, out.case(condition, procedure))
 
 
-def _ready(condition: Condition, procedure: Procedure, study: Study, out: Imaged) -> bool:
+def _ready(condition: Condition, procedure: Procedure, base: dict[str, Any], out: Imaged) -> bool:
     """Whether a case is there. Raises `InputError` if it was made with other settings."""
     path = out.case(condition, procedure) / _ORIGIN
     if not path.is_file():
         return False
-    if read_json(path) != _origin(condition, procedure, study):
+    if read_json(path) != _origin(condition, procedure, base):
         raise InputError(f"{path.parent}: was made with other settings than those of this condition. Remove it.")
     return True
 
 
-def _origin(condition: Condition, procedure: Procedure, study: Study) -> dict[str, Any]:
+def _origin(condition: Condition, procedure: Procedure, base: dict[str, Any]) -> dict[str, Any]:
     voxels = (REGISTERED_MM, _imaged_mm(procedure))
     usual = asdict(Told())
     said = {key: value for key, value in asdict(condition.told).items() if value != usual[key]}
     told = {"procedure": asdict(procedure), "voxels_mm": voxels, "told": said}
-    return plain(told | {"simulation": _content(condition, study)})
+    return plain(told | {"simulation": simulation_of(condition, base)})
 
 
-def _content(condition: Condition, study: Study) -> dict[str, Any]:
-    change = {"acquisition": condition.acquisition, "xray": condition.xray}
-    return laid_over(load_preset("simulation", study.acquisition), change, f"condition {condition.name}")
+def simulation_of(condition: Condition, base: dict[str, Any]) -> dict[str, Any]:
+    """What a condition makes of simulation settings: content of a `Simulation`."""
+    change: dict[str, Any] = {"acquisition": condition.acquisition, "xray": condition.xray}
+    change |= {} if condition.carm is None else {"carm": condition.carm}
+    return laid_over(base, change, f"condition {condition.name}")
 
 
 def _imaged_mm(procedure: Procedure) -> float:
     return PROCEDURAL_IMAGED_MM if procedure.procedural else REAL_IMAGED_MM
 
 
-class _Body:
+class Body:
     """The patient of a procedure: its folder, and its mass along the rays of any view, made once and kept on disk."""
 
     def __init__(self, procedure: Procedure, stores: Stores, folder: Path) -> None:
@@ -180,14 +185,14 @@ class _Body:
             return subject_folder(self.procedure.patient, REGISTERED_MM, self.stores)
         folder = self.folder / "patient"
         if not folder.is_dir():
-            write_patient_case(self._made()[0], folder, self.device_seed, self.procedure.side)
+            write_patient_case(self._made()[0], folder, self.device_seed, self.procedure.hip)
         return folder
 
     def areal(
         self, pose: Tensor, known: Preoperative, drawn: theatre.Procedure, camera: Camera, step_mm: float
     ) -> dict[str, Tensor]:
         """Mass per area (H, W) in g/cm² of each material of the patient, seen from `camera_from_lps` (4, 4)."""
-        key = _digest(pose, drawn.femur_rotation, asdict(camera), step_mm, _imaged_mm(self.procedure))
+        key = digest(pose, drawn.femur_rotation, asdict(camera), step_mm, _imaged_mm(self.procedure))
         path = self.folder / f"{key}.pt"
         if path.is_file():
             found: dict[str, Tensor] = torch.load(path, weights_only=True)
@@ -205,7 +210,7 @@ class _Body:
         return self._images[1]
 
     def _posed(self, known: Preoperative, drawn: theatre.Procedure, camera: Camera) -> PosedTissue:
-        key = _digest(drawn.camera_from_pelvis, drawn.femur_rotation, asdict(camera))
+        key = digest(drawn.camera_from_pelvis, drawn.femur_rotation, asdict(camera))
         if self._tissue is None or self._tissue[0] != key:
             ct, labels = self._imaged(known)
             self._tissue = key, posed_tissue(ct, labels, known.femur, known.head, drawn, camera)
@@ -229,41 +234,56 @@ class _Body:
         return self._scans
 
 
-def _digest(*values: Any) -> str:
-    return hashlib.sha256(json.dumps(plain(values)).encode()).hexdigest()[:16]
-
-
-def _make_case(condition: Condition, procedure: Procedure, study: Study, body: _Body, target: Path) -> None:
-    """Write one case. With the study's own settings its images are those of the study, bit for bit."""
-    settings = read_record(Simulation, _content(condition, study), f"condition {condition.name}")
+def make_case(
+    condition: Condition, procedure: Procedure, base: dict[str, Any], body: Body, target: Path
+) -> theatre.Procedure:
+    """Write one case, and tell how it was drawn. With the settings `base` alone its images are theirs, bit for bit."""
+    content = simulation_of(condition, base)
+    settings = read_record(Simulation, content, f"condition {condition.name}")
     generator = torch.Generator().manual_seed(procedure.seed)
     patient = body.patient()
     with new_folder(target) as folder:
-        known = read_preoperative(patient, procedure.side, body.device_seed, settings, folder / f"{DEVICE}.stl")
+        known = read_preoperative(patient, procedure.hip, body.device_seed, settings, folder / f"{DEVICE}.stl")
         known = copied(known, folder)
-        mesh = read_mesh(known.device.model.path)
-        drawn = theatre.draw_procedure(known, mesh, settings.acquisition, generator)
-        camera, step_mm = known.case.carm.camera, settings.acquisition.step_mm
+        drawn = theatre.draw_procedure(known, read_mesh(known.device.model.path), settings.acquisition, generator)
+        images = body.images(digest(content), lambda: image_views(body, known, drawn, settings, generator))
+        write_told(folder, known, images, drawn, condition.told, body.device_seed)
+        write_json(folder / _ORIGIN, _origin(condition, procedure, base))
+    return drawn
 
-        def areal(pose: Tensor) -> dict[str, Tensor]:
-            return body.areal(pose, known, drawn, camera, step_mm)
 
-        def imaged() -> list[ViewImages]:
-            metal = metal_in_beam(mesh, body.device_seed, settings.acquisition)
-            return view_images(areal, metal, drawn, camera, step_mm, settings.xray, generator, lambda _: None)
+def image_views(
+    body: Body, known: Preoperative, drawn: theatre.Procedure, settings: Simulation, generator: torch.Generator
+) -> list[ViewImages]:
+    """The images of a procedure as it was drawn."""
+    camera, step_mm = known.case.carm.camera, settings.acquisition.step_mm
 
-        images = body.images(_digest(_content(condition, study)), imaged)
-        said = replace(known, case=_said(known.case, condition.told))
-        write_images_and_case(folder, said, [_binned(view, condition.told.binned) for view in images], drawn)
-        if not condition.told.device_images:
-            _without_device_images(folder)
-        if condition.told.parts:
-            _name_parts(folder, body.device_seed, condition.told.materials)
-        if condition.told.ct is not None:
-            spoil_ct(folder, known.head, condition.told.ct)
-        if condition.told.fault is not None:
-            FAULTS[condition.told.fault](folder)
-        write_json(folder / _ORIGIN, _origin(condition, procedure, study))
+    def areal(pose: Tensor) -> dict[str, Tensor]:
+        return body.areal(pose, known, drawn, camera, step_mm)
+
+    metal = metal_in_beam(read_mesh(known.device.model.path), body.device_seed, settings.acquisition)
+    return view_images(areal, metal, drawn, camera, step_mm, settings.xray, generator, lambda _: None)
+
+
+def write_told(
+    folder: Path,
+    known: Preoperative,
+    images: list[ViewImages],
+    drawn: theatre.Procedure,
+    told: Told,
+    device_seed: int,
+) -> None:
+    """Write images and case into a folder that holds the patient; the case says what is told."""
+    said = replace(known, case=_said(known.case, told))
+    write_images_and_case(folder, said, [_binned(view, told.binned) for view in images], drawn)
+    if not told.device_images:
+        _without_device_images(folder)
+    if told.parts:
+        _name_parts(folder, device_seed, told.materials)
+    if told.ct is not None:
+        spoil_ct(folder, known.head, told.ct)
+    if told.fault is not None:
+        FAULTS[told.fault](folder)
 
 
 def _said(case: Case, told: Told) -> Case:

@@ -1,9 +1,13 @@
-"""Cases that are wrong in a way which nothing contradicts: mirrored patients, views, devices, a view told three times.
+"""Cases that are wrong in a way which nothing contradicts.
+
+Mirrored patients, views and devices, a view told three times, the CT of somebody else, a femur that has broken since
+the CT, a device that is bent.
 
 A registration of such a case cannot be right, and must say so.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +15,20 @@ import numpy as np
 import SimpleITK as sitk
 import torch
 import yaml
+from scipy import ndimage
+from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, label_table
-from femoreg_torch.case.femoroplasty import DEVICE, femoral_head
+from femoreg_torch.case.femoroplasty import DEVICE, femoral_head, operated_femur
 from femoreg_torch.files import read_json, write_json, write_text
+from femoreg_torch.geometry import about_point, exp_so3, rigid, transform_points
 from femoreg_torch.volume import Volume, read_ct, read_labels, read_landmarks, read_mesh, write_landmarks, write_volume
+from sim.patient import make_patient, write_patient
 
+_SOMEBODY_ELSE = 990001  # seed of a patient that no study images
+_BREAK_MM, _BREAK_DEG = 32.0, 20.0  # where the neck breaks, from the centre of the head, and how far the head turns
+_SOFT_TISSUE_HU = 40.0
+_BEND_MM = 6.0
 _LABELS = "femoreg"  # the table of the ids in these cases
 
 
@@ -40,6 +52,11 @@ def mirror_patient(folder: Path) -> None:
     names = {landmark.name: landmark.mirror for landmark in HIP.landmarks}
     after = {names[name]: mirror * point for name, point in before.items()}
     write_landmarks(folder / "landmarks.json", after)
+    _keep_entry_point(folder, before, after)
+
+
+def _keep_entry_point(folder: Path, before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> None:
+    """Let the entry point lie as far from the operated femoral head as before."""
     content = read_case_file(folder)
     head = femoral_head(content["side"])
     entry = torch.tensor(content["plan"]["entry_point"], dtype=torch.float64) - before[head] + after[head]
@@ -74,11 +91,70 @@ def mirror_device(folder: Path) -> None:
     mesh.export(path)
 
 
+def take_another_patient(folder: Path) -> None:
+    """Put CT, label map and landmarks of another patient in place of the right ones; the entry point as mirrored ones.
+
+    The truth tells poses of a patient that the case does not have: errors against it say nothing.
+    """
+    ct = read_ct(folder / "ct.nii.gz")
+    before = read_landmarks(folder / "landmarks.json")
+    write_patient(folder, make_patient(_SOMEBODY_ELSE, min(max(ct.spacing_mm[0], 0.5), 2.0)))
+    _keep_entry_point(folder, before, read_landmarks(folder / "landmarks.json"))
+
+
+def break_femur(folder: Path) -> None:
+    """Turn head and neck of the operated femur in CT and label map, about the head, and leave the shaft.
+
+    The truth is that of the shaft, with the entry point.
+    """
+    ct = read_ct(folder / "ct.nii.gz")
+    labels = read_labels(folder / "labels.nii.gz", ct)
+    content = read_case_file(folder)
+    head = read_landmarks(folder / "landmarks.json")[femoral_head(content["side"])]
+    (bone,) = label_table(_LABELS)[operated_femur(content["side"])]
+    axis = head - torch.tensor(content["plan"]["entry_point"], dtype=torch.float64)
+    axis = axis / axis.norm()
+
+    femur = labels.data.numpy() == bone
+    index = np.argwhere(femur)[:, ::-1]
+    points = transform_points(labels.lps_from_index, torch.from_numpy(index.copy()).double())
+    proximal = np.zeros_like(femur)
+    above = ((points - head) @ axis > -_BREAK_MM).numpy()
+    proximal[tuple(index[above][:, ::-1].T)] = True
+
+    # Each voxel takes what lies at its place turned back.
+    about_ap = torch.tensor([0.0, math.radians(_BREAK_DEG), 0.0], dtype=torch.float64)
+    back = torch.linalg.inv(ct.lps_from_index) @ about_point(rigid(exp_so3(-about_ap)), head) @ ct.lps_from_index
+    matrix, shift = back[:3, :3].flip(0, 1).numpy(), back[:3, 3].flip(0).numpy()
+    hu = ct.data.numpy().astype(np.float32)
+    turned = ndimage.affine_transform(proximal.astype(np.float32), matrix, shift, order=1) > 0.5
+    moved_hu = ndimage.affine_transform(hu, matrix, shift, order=1)
+    others = (labels.data.numpy() > 0) & ~femur
+    turned &= ~others
+    new_hu = np.where(turned, moved_hu, np.where(proximal, np.float32(_SOFT_TISSUE_HU), hu))
+    new_labels = np.where(turned, bone, np.where(proximal, 0, labels.data.numpy())).astype(np.uint8)
+    write_volume(folder / "ct.nii.gz", ct.with_data(torch.from_numpy(new_hu.round().astype(np.int16))))
+    write_volume(folder / "labels.nii.gz", labels.with_data(torch.from_numpy(new_labels)))
+
+
+def bend_device(folder: Path) -> None:
+    """Bend the device's surface across its guide, by 6 mm at 100 mm from its base; the named points stay."""
+    path = folder / f"{DEVICE}.stl"
+    mesh = read_mesh(path)
+    vertices = mesh.vertices.copy()
+    vertices[:, 1] += _BEND_MM * (vertices[:, 2] / 100) ** 2
+    mesh.vertices = vertices
+    mesh.export(path)
+
+
 FAULTS: dict[str, Callable[[Path], None]] = {
     "mirrored patient": mirror_patient,
     "mirrored view": mirror_second_view,
     "repeated view": repeat_first_view,
     "mirrored device": mirror_device,
+    "another patient": take_another_patient,
+    "fractured femur": break_femur,
+    "bent device": bend_device,
 }
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from femoreg_torch.configs import load_preset
 
 from femoreg_torch.case.model import Side
+from femoreg_torch.errors import InputError
 from femoreg_torch.settings import read_record
 from sim.study.detections import DetectionNoise
 
@@ -29,13 +30,20 @@ class Procedure:
 
     number: int  # from 1
     patient: str  # name of a subject, or the seed of a procedural patient
-    side: Side
+    side: Side | None  # None: a recorded case of something else than a hip
     seed: int
 
     @property
     def procedural(self) -> bool:
         """Whether the patient is computed from a seed, rather than built around real bone shapes."""
         return self.patient.isdigit()
+
+    @property
+    def hip(self) -> Side:
+        """The operated side. Raises `InputError` where there is none."""
+        if self.side is None:
+            raise InputError(f"procedure {self.number}: {self.patient} has no operated side, so it is not simulated.")
+        return self.side
 
     @property
     def name(self) -> str:

@@ -1,6 +1,6 @@
 """Statistics of a study's records: errors over all runs, and whether wrong runs are flagged."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,12 @@ Record = dict[str, Any]
 
 WRONG_MM, WRONG_DEG = 4.0, 2.0  # beyond these a pose that says it can be trusted does harm
 OBJECTS = ("pelvis", "femur", "device")
+
+
+def outcome(record: Record) -> Record:
+    """Whether a record that was made is one of a refusal, and why."""
+    refused = record["refused"]
+    return {"status": "done" if refused is None else "refused", "reason": refused or ""}
 
 
 @dataclass(frozen=True)
@@ -147,22 +153,34 @@ def rows_of_csv(records: Sequence[Record]) -> list[dict[str, Any]]:
             key: record[key] for key in ("number", "kind", "patient", "side", "seed", "preset", "trusted", "refused")
         }
         row["reason"] = "; ".join(record["reasons"])
-        for prefix, errors in (("", record.get("errors", {})), ("start_", record.get("start_errors", {}))):
-            for key, value in errors.items():
-                if not isinstance(value, dict):
-                    row[f"{prefix}{key}"] = value
-                    continue
-                for unit in ("mm", "deg"):
-                    row[f"{prefix}{key}_{unit}"] = value[unit]
-                    for axis, part in zip(("is", "lr", "ap"), value[f"{unit}_xyz"], strict=True):
-                        row[f"{prefix}{key}_{unit}_{axis}"] = part
-        for stage in record.get("stages", ()):
-            name = stage["name"].replace(" ", "_") + ("" if stage["view"] is None else f"_view{stage['view']}")
-            row[f"evaluations_{name}"] = stage["evaluations"]
-            row[f"seconds_{name}"] = stage["seconds"]
+        row |= flat_errors(record.get("errors", {})) | flat_errors(record.get("start_errors", {}), "start_")
+        row |= flat_stages(record.get("stages", ()))
         row |= {f"seconds_{key}": value for key, value in record.get("timings_s", {}).items()}
         rows.append(row)
     return rows
+
+
+def flat_errors(errors: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
+    """Errors by name and unit, those of poses signed along each axis too."""
+    row: dict[str, float] = {}
+    for key, value in errors.items():
+        if not isinstance(value, dict):
+            row[f"{prefix}{key}"] = value
+            continue
+        for unit in ("mm", "deg"):
+            row[f"{prefix}{key}_{unit}"] = value[unit]
+            for axis, part in zip(("is", "lr", "ap"), value[f"{unit}_xyz"], strict=True):
+                row[f"{prefix}{key}_{unit}_{axis}"] = part
+    return row
+
+
+def flat_stages(stages: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Evaluations and seconds of every step, and of every view that it is run on."""
+    row: dict[str, float] = {}
+    for stage in stages:
+        name = stage["name"].replace(" ", "_") + ("" if stage["view"] is None else f"_view{stage['view']}")
+        row |= {f"evaluations_{name}": stage["evaluations"], f"seconds_{name}": stage["seconds"]}
+    return row
 
 
 def all_quantities(records: Sequence[Record]) -> list[tuple[Quantity, Statistics]]:

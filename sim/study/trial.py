@@ -1,21 +1,24 @@
 """One procedure of a study registered, and everything worth keeping of it as a record for a JSON file."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from femoreg_torch.case import Case, Result, read_case
 from femoreg_torch.case.femoroplasty import PELVIS
 from femoreg_torch.detect import load_network
 from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation import errors, reference_points
+from femoreg_torch.evaluation import errors, path_displacements, reference_points
 from femoreg_torch.files import plain
 from femoreg_torch.geometry import Poses
 from femoreg_torch.registration import Plan
 from femoreg_torch.registration.run import register_scene
 from femoreg_torch.registration.scene import Scene
+from femoreg_torch.registration.start import Detector
 from sim.study.detections import simulated_detector
 from sim.study.procedures import Procedure, Study
 from sim.study.summary import OBJECTS
@@ -27,22 +30,41 @@ def run_trial(folder: Path, procedure: Procedure, study: Study, plan: Plan, view
     A registration that refuses its input (`InputError`) is a result too: `refused` then holds the reason, else None,
     and there are no `errors`.
     """
-    case = read_case(folder)
+    case = first_views(read_case(folder), views)
     if case.truth is None:
         raise InputError(f"{folder}: has no truth, so there is nothing to measure errors against.")
-    truth = case.truth
-    if views is not None:
-        truth = truth.first_views(views)
-        case = replace(case, views=case.views[:views], truth=truth)
     find = simulated_detector(
-        case.landmarks, truth.camera1_from[PELVIS], study.detections, procedure.seed, load_network()
+        case.landmarks, case.truth.camera1_from[PELVIS], study.detections, procedure.seed, load_network()
     )
     record: dict[str, Any] = {**asdict(procedure), "kind": kind(procedure), "preset": plan.preset}
+    return record | register_case(case, plan, procedure.number, find)[0]
+
+
+def register_case(
+    case: Case,
+    plan: Plan,
+    seed: int,
+    find: Detector | None = None,
+    start: Mapping[str, Tensor] | None = None,
+    scene: Scene | None = None,
+) -> tuple[dict[str, Any], Result | None]:
+    """Register a case, and tell what is worth keeping, with errors where it has a truth; and the result, if any.
+
+    `find`, `start` and `scene` are as in `femoreg_torch.registration.run.register_scene`.
+    """
     try:
-        result, scene = register_scene(case, None, plan, seed=procedure.number, find=find)
+        result, scene = register_scene(case, scene, plan, seed=seed, find=find, start=start)
     except InputError as error:
-        return record | {"refused": str(error), "trusted": False, "reasons": []}
-    return plain(record | {"refused": None} | _measured(case, scene, truth, result))
+        return {"refused": str(error), "trusted": False, "reasons": []}, None
+    return plain({"refused": None} | _told(result, scene) | _measured(case, scene, result)), result
+
+
+def first_views(case: Case, views: int | None) -> Case:
+    """The case with only so many of its views; with all if None."""
+    if views is None:
+        return case
+    truth = None if case.truth is None else case.truth.first_views(views)
+    return replace(case, views=case.views[:views], truth=truth)
 
 
 def kind(procedure: Procedure) -> str:
@@ -50,22 +72,38 @@ def kind(procedure: Procedure) -> str:
     return "procedural" if procedure.procedural else "real"
 
 
-def _measured(case: Case, scene: Scene, truth: Poses, result: Result) -> dict[str, Any]:
+def _measured(case: Case, scene: Scene, result: Result) -> dict[str, Any]:
+    """Errors against the truth of a case; nothing where it has none."""
+    truth = case.truth
+    if truth is None:
+        return {}
     points = reference_points(case, scene)
     assert result.start is not None  # of a registration that has just run
     at_start = scene.start(result.start.camera1_from_object)
-    poses = {"camera_from_pelvis": result.poses.camera_from(PELVIS)}
-    poses |= {f"camera1_from_{name}": pose for name, pose in result.poses.camera1_from.items() if name != PELVIS}
     return {
         "errors": errors(truth, result.poses, points),
+        "displacements_mm": path_displacements(truth, result.poses, points),
         "start_errors": {name: row for name, row in errors(truth, at_start, points).items() if name in OBJECTS},
-        "asked": [name for name in truth.camera1_from if scene.there(scene.objects[name].shown_in, range(scene.views))],
+        "asked": _asked(truth, scene),
+    }
+
+
+def _asked(truth: Poses, scene: Scene) -> list[str]:
+    """The objects that the images show."""
+    return [name for name in truth.camera1_from if scene.there(scene.objects[name].shown_in, range(scene.views))]
+
+
+def _told(result: Result, scene: Scene) -> dict[str, Any]:
+    """What a result says of itself."""
+    assert result.start is not None
+    others = {f"camera1_from_{name}": pose for name, pose in result.poses.camera1_from.items() if name != result.anchor}
+    return {
         "landmarks_used": sum(mark.used for mark in result.start.landmarks.values()),
         "trusted": result.verdict.trusted,
         "reasons": list(result.verdict.reasons),
         "skipped": list(result.skipped),
         "quality": {name: asdict(value) for name, value in result.quality.items()},
-        "poses": poses,
+        "poses": {f"camera_from_{result.anchor}": result.poses.camera_from(result.anchor)} | others,
         "stages": [
             {key: getattr(stage, key) for key in ("name", "view", "evaluations", "seconds")} for stage in result.stages
         ],

@@ -20,8 +20,8 @@ from femoreg_torch.evaluation import errors, reference_points
 from femoreg_torch.files import plain, write_json
 from femoreg_torch.registration import Plan, prepare_scene, run_plan
 from femoreg_torch.registration.quality import Limits, assess
-from sim.study.capture import Offset, displaced
 from sim.study.page import machine, table, write_section
+from sim.study.starts import Offset, displaced
 from sim.study.summary import confusion
 
 _NONE = Offset(0, 0, 0)

@@ -58,7 +58,7 @@ def draw_procedure(
     ap = nominal_ap(known.head, known.side, settings)
     pivot = torch.tensor([0.0, 0.0, settings.head_depth_mm], dtype=torch.float64)
     room_from_pelvis = about_point(settings.pelvis.draw(generator), pivot) @ ap
-    camera_from_pelvis = torch.stack([stop @ room_from_pelvis for stop in _draw_stops(carm, settings, generator)])
+    camera_from_pelvis = torch.stack([stop @ room_from_pelvis for stop in draw_stops(carm, settings, generator)])
 
     femur_motion = settings.femur.draw(generator)
     camera1_from_femur = camera_from_pelvis[0] @ about_point(femur_motion, known.head)
@@ -77,7 +77,7 @@ def draw_procedure(
     )
 
 
-def _draw_stops(carm: CArm, settings: Acquisition, generator: torch.Generator) -> list[Tensor]:
+def draw_stops(carm: CArm, settings: Acquisition, generator: torch.Generator) -> list[Tensor]:
     """`camera_from_room` (4, 4) of every C-arm stop; the room is the camera frame of the unperturbed first view."""
     isocentre = torch.tensor(carm.isocentre_mm, dtype=torch.float64)
     stops = []

@@ -20,12 +20,16 @@ from femoreg_torch.volume import (
     write_landmarks,
     write_volume,
 )
+from sim.patient import Patient
 from sim.study.faults import (
+    bend_device,
+    break_femur,
     mirror_device,
     mirror_patient,
     mirror_second_view,
     read_case_file,
     repeat_first_view,
+    take_another_patient,
     write_case_file,
 )
 
@@ -95,3 +99,54 @@ def test_a_mirrored_device_is_a_closed_surface_on_the_other_side(folder: Path) -
     assert mesh.is_volume
     assert mesh.volume == pytest.approx(4 * 6 * 30)
     assert mesh.center_mass == pytest.approx([-3, 0, 0], abs=1e-6)
+
+
+def test_another_patient_takes_the_place_of_the_right_one_and_keeps_the_plan(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[int, float]] = []
+
+    def small(seed: int, spacing_mm: float) -> Patient:
+        asked.append((seed, spacing_mm))
+        ct = Volume(torch.linspace(-1000, 900, 1000).reshape(10, 10, 10), axis_aligned((2.0,) * 3, (0.0,) * 3))
+        points = {"FH-l": torch.tensor([1.0, 2.0, 3.0]).double(), "FH-r": torch.zeros(3).double()}
+        return Patient(ct, ct.with_data((ct.data > 0).to(torch.uint8)), points, {})
+
+    monkeypatch.setattr("sim.study.faults.make_patient", small)
+    take_another_patient(folder)
+    assert asked == [(990001, pytest.approx(2.0))]
+    assert read_ct(folder / "ct.nii.gz").data.shape == (10, 10, 10)
+    assert set(read_landmarks(folder / "landmarks.json")) == {"FH-l", "FH-r"}
+    assert read_case_file(folder)["plan"]["entry_point"] == pytest.approx([4.0, 3.0, 4.0])  # 3, 1, 1 from the head
+
+
+def test_the_neck_breaks_and_the_shaft_stays(tmp_path: Path) -> None:
+    """A straight femur along x from its head at the origin: what is nearer than 32 mm has turned by 20° about y."""
+    affine = axis_aligned((1.0, 1.0, 1.0), (-10.0, -10.0, -40.0))
+    labels = torch.zeros(81, 21, 91, dtype=torch.uint8)
+    labels[35:46, 5:16, 5:86] = 5  # x from -5 to 75, z from -5 to 5
+    labels[70:, :, :] = 1  # the pelvis, out of reach
+    write_volume(tmp_path / "labels.nii.gz", Volume(labels, affine))
+    write_volume(tmp_path / "ct.nii.gz", Volume(torch.where(labels == 5, 500.0, -100.0), affine))
+    write_landmarks(tmp_path / "landmarks.json", {"FH-l": torch.zeros(3).double()})
+    write_case_file(tmp_path, {"side": "left", "plan": {"entry_point": [75.0, 0.0, 0.0], "target": "FH"}})
+    break_femur(tmp_path)
+    ct = read_ct(tmp_path / "ct.nii.gz")
+    after = read_labels(tmp_path / "labels.nii.gz", ct)
+    x = torch.arange(91) - 10
+    assert torch.equal(after.data[..., x > 33], labels[..., x > 33])
+    assert torch.equal(after.data == 1, labels == 1)
+    neck = (after.data == 5)[..., (x > 18) & (x < 22)].nonzero()[:, 0].double() - 40
+    assert abs(neck.mean().item()) == pytest.approx(20 * np.tan(np.radians(20)), abs=1)
+    assert (ct.data[after.data == 5] > 200).float().mean() > 0.9
+    assert (ct.data[(labels == 5) & (after.data == 0)] == 40).all()  # soft tissue where the neck was
+
+
+def test_a_bent_device_is_closed_and_its_base_stays(folder: Path) -> None:
+    straight = trimesh.load_mesh(folder / f"{DEVICE}.stl")
+    bend_device(folder)
+    bent = trimesh.load_mesh(folder / f"{DEVICE}.stl")
+    assert bent.is_volume
+    assert bent.volume == pytest.approx(straight.volume)
+    shift = bent.bounds[1] - straight.bounds[1]
+    assert shift == pytest.approx([0, 6 * 0.15**2, 0])

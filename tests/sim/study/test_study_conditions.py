@@ -1,57 +1,42 @@
 """A coarse procedure under all conditions: the patient's rays are cast once, and cases tell what they are meant to."""
 
-import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from coarse import PROCEDURE, SIMULATION, stores_in
 
 from femoreg_torch.case import read_case
 from femoreg_torch.case.femoroplasty import device_of
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import plain
 from femoreg_torch.fluoro import read_image
-from femoreg_torch.geometry import load_carm, rotation_angle, transform_points
+from femoreg_torch.geometry import rotation_angle, transform_points
 from femoreg_torch.volume import read_ct, read_mesh
-from sim.commands import phantom
 from sim.study import conditions as module
 from sim.study.cases import Stores
 from sim.study.conditions import Condition, Imaged, image_procedure, make_conditions, read_conditions
-from sim.study.procedures import Procedure, Study, load_study
+from sim.study.procedures import Study, load_study
 from sim.theatre.case_folders import write_simulation
 from sim.theatre.metal import draw_materials
 from sim.theatre.preoperative_case import read_preoperative
 from sim.theatre.procedure import draw_procedure
 from sim.theatre.settings import load_simulation
 
-PROCEDURE = Procedure(number=1, patient="somebody", side="right", seed=2)
 CONDITIONS = read_conditions("conditions")
 
 
 @pytest.fixture(scope="module")
-def stores(tmp_path_factory: pytest.TempPathFactory) -> Stores:
-    """A coarse patient where both scans of a subject would stand, with a device of the procedure's seed."""
-    root = tmp_path_factory.mktemp("study")
-    stores = Stores(root / "cases", root / "patients", root / "data")
-    folder = stores.patients / "somebody"
-    phantom(folder / "1.0", seed=PROCEDURE.seed, side="right", spacing_mm=2.0)
-    shutil.copytree(folder / "1.0", folder / "0.5")
-    return stores
+def stores(coarse_root: Path) -> Stores:
+    return stores_in(coarse_root)
 
 
 @pytest.fixture(scope="module")
 def study(stores: Stores) -> Study:
     """That of the accuracy study, with 16 × 16 pixels of the C-arm in one."""
-    folder = stores.cases.parent
-    carm = load_carm("cios_fusion")
-    settings = asdict(carm.camera.downsampled(16)) | {"isocentre_mm": carm.isocentre_mm}
-    (folder / "carm.yaml").write_text(yaml.safe_dump(plain(settings)), encoding="utf-8")
-    content = {"extends": "paper", "carm": str(folder / "carm.yaml"), "acquisition": {"step_mm": 1.0}}
-    (folder / "coarse.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
-    return replace(load_study("accuracy"), acquisition=str(folder / "coarse.yaml"))
+    return replace(load_study("accuracy"), acquisition=str(stores.cases.parent / SIMULATION))
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,110 @@
+"""Where the batches of a study are done: in processes of this machine (joblib, loky), or on a cluster (Dask)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from joblib import Parallel, delayed, parallel_config
+from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+from femoreg_torch.errors import InputError
+from sim.study.engine import Work, give_up, perform
+from sim.study.store import Batch, Store
+
+PATIENCE = "30s"  # with a scheduler that does not answer
+
+
+@dataclass(frozen=True)
+class OnThisMachine:
+    """So many processes, each on one core; with one, this process does it all."""
+
+    jobs: int
+
+    def __call__(self, work: Work, store: Store, todo: Sequence[Batch], done: Callable[[Batch], None]) -> None:
+        """Where a process is killed, all are; those that may have been the cause are then tried again one by one."""
+        left = {batch.procedure.number: batch for batch in todo}
+        while left:
+            before = len(left)
+            try:
+                self._all_at_once(work, store, left, done)
+            except TerminatedWorkerError:
+                suspects = store.clear_killed() & left.keys()
+                if not suspects and len(left) == before:
+                    raise
+                for number in sorted(suspects):
+                    self._alone(work, store, left.pop(number), done)
+
+    def _all_at_once(self, work: Work, store: Store, left: dict[int, Batch], done: Callable[[Batch], None]) -> None:
+        with parallel_config(backend="loky", inner_max_num_threads=1):
+            tasks = (delayed(_perform)(work, store, batch) for batch in list(left.values()))
+            for number in Parallel(n_jobs=self.jobs, return_as="generator_unordered")(tasks):
+                done(left.pop(number))
+
+    def _alone(self, work: Work, store: Store, batch: Batch, done: Callable[[Batch], None]) -> None:
+        rest = batch
+        while rest.runs:
+            try:
+                with parallel_config(backend="loky", inner_max_num_threads=1):
+                    Parallel(n_jobs=2)([delayed(_perform)(work, store, rest)])  # one process beside this one
+                break
+            except TerminatedWorkerError:
+                store.clear_killed()
+                rest = give_up(store, rest)
+        done(batch)
+
+
+@dataclass(frozen=True)
+class OnCluster:
+    """The workers of a Dask scheduler. They have to see the folder of the study under the same path."""
+
+    address: str
+
+    def __call__(self, work: Work, store: Store, todo: Sequence[Batch], done: Callable[[Batch], None]) -> None:
+        """A batch whose worker dies is given to another; one that ends several of them is given up.
+
+        Raises `InputError` if the scheduler does not answer or goes away, or its workers run several tasks at a time.
+        """
+        from distributed import Client, KilledWorker, as_completed
+
+        try:
+            client = Client(self.address, timeout=PATIENCE, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"--scheduler {self.address}: does not answer ({' '.join(str(error).split())}). Give the address that "
+                "`dask scheduler` prints."
+            ) from error
+        with client:
+            _check_workers(client.scheduler_info(n_workers=-1)["workers"], self.address)
+            waiting = {client.submit(_perform, work, store, batch, pure=False): (batch, batch) for batch in todo}
+            finished = as_completed(waiting, loop=client.loop)
+            for future in finished:
+                whole, batch = waiting.pop(future)
+                if future.cancelled():
+                    raise InputError(
+                        f"--scheduler {self.address}: has gone. The runs that are done are kept: give the same command "
+                        "again once it is there."
+                    )
+                failure = future.exception()
+                if isinstance(failure, KilledWorker):
+                    rest = give_up(store, batch)
+                    if rest.runs:
+                        again = client.submit(_perform, work, store, rest, pure=False)
+                        waiting[again] = whole, rest
+                        finished.add(again)
+                        continue
+                elif failure is not None:
+                    raise failure
+                done(whole)
+
+
+def _check_workers(workers: dict[str, dict[str, int]], address: str) -> None:
+    for worker in workers.values():
+        if worker["nthreads"] > 1:
+            raise InputError(
+                f"--scheduler {address}: a worker has {worker['nthreads']} threads, but a registration needs a process "
+                "of its own. Start workers with `--nthreads 1 --nworkers N`."
+            )
+
+
+def _perform(work: Work, store: Store, batch: Batch) -> int:
+    perform(work, store, batch)
+    return batch.procedure.number

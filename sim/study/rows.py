@@ -1,0 +1,93 @@
+"""`runs.parquet`: the records of a study as one table, a row for each run."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from femoreg_torch.files import temporary_file
+from sim.study.summary import Record, flat_errors, flat_stages
+
+TABLE_NAME = "runs.parquet"
+_AXES = ("is", "lr", "ap")
+_PER_AXIS = (1, 0, 2)  # errors are told along IS, LR and AP, deviations along the camera's x, y and z
+_DIFFERS = ("seconds_", "host", "version_")  # what may differ between two runs of the same study
+_HEAD = ("study", "condition", "number", "patient", "kind", "side", "seed", "preset", "code", "settings")
+_LAST = ("evaluations_", "seconds_", "version_", "host")  # beginnings of the columns that stand at the end
+
+Row = dict[str, Any]
+
+
+def rows_of(record: Record) -> list[Row]:
+    """The row of a run; of a closed loop, one for each round."""
+    head: Row = {key: record[key] for key in _HEAD}
+    head |= {f"varied_{key}": value for key, value in record["varied"].items()}
+    tail = {"seconds_run": record["run_s"]} if "run_s" in record else {}
+    tail |= {f"version_{key}": value for key, value in record["versions"].items()} | {"host": record["host"]}
+    rounds = [record | found for found in record.get("rounds", [{}])]
+    return [head | _of_round(found) | tail for found in rounds]
+
+
+def _of_round(record: Record) -> Row:
+    row: Row = {key: record[key] for key in ("status", "reason", "trusted")}
+    row["reasons"] = "; ".join(record["reasons"])
+    row["asked"] = " ".join(record.get("asked", ()))
+    row |= {key: record[key] for key in ("round", "before_mm", "before_deg", "left_mm", "left_deg") if key in record}
+    row |= flat_errors(record.get("errors") or {}) | flat_errors(record.get("start_errors") or {}, "start_")
+    for point, shift in (record.get("displacements_mm") or {}).items():
+        row |= {f"{point}_mm_{axis}": part for axis, part in zip(_AXES, shift, strict=True)}
+    for name, quality in record.get("quality", {}).items():
+        row[f"{name}_trusted"] = quality["trusted"]
+        for unit, key in (("mm", "translation_deviation_mm"), ("deg", "rotation_deviation_deg")):
+            row |= {f"{name}_sigma_{unit}_{axis}": quality[key][n] for axis, n in zip(_AXES, _PER_AXIS, strict=True)}
+    row |= flat_stages(record.get("stages", ()))
+    return row | {f"seconds_{key}": value for key, value in record.get("timings_s", {}).items()}
+
+
+def table_of(records: Sequence[Record]) -> pa.Table:
+    """All rows, in the order of the records; a column for all that any of them tells."""
+    rows = [row for record in records for row in rows_of(record)]
+    names = sorted(dict.fromkeys(name for row in rows for name in row), key=_place)
+    return pa.table({name: _column([row.get(name) for row in rows]) for name in names})
+
+
+def _place(name: str) -> int:
+    """What is told of a run, what was varied, results, costs, versions and host; in each as the rows have them."""
+    if name in _HEAD:
+        return 0
+    last = (place for place, start in enumerate(_LAST, 3) if name.startswith(start))
+    return 1 if name.startswith("varied_") else next(last, 2)
+
+
+def _column(values: list[Any]) -> pa.Array:
+    """Of whole numbers, of numbers, of truth values or of text: whatever holds them all."""
+    kinds = {type(value) for value in values if value is not None}
+    if kinds == {bool}:
+        return pa.array(values, pa.bool_())
+    if kinds == {int}:
+        return pa.array(values, pa.int64())
+    if kinds <= {int, float}:
+        return pa.array(values, pa.float64())
+    return pa.array([value if value is None else str(value) for value in values], pa.string())
+
+
+def write_table(path: Path, records: Sequence[Record]) -> pa.Table:
+    """Write the table of these records, whole or not at all. Returns it."""
+    table = table_of(records)
+    with temporary_file(path) as part:
+        pq.write_table(table, part)
+    return table
+
+
+def read_table(path: Path) -> pa.Table:
+    """The table of a study."""
+    return pq.read_table(path)
+
+
+def comparable(table: pa.Table) -> list[Mapping[str, Any]]:
+    """The rows without times, hosts and versions: those of two runs of the same study are equal."""
+    kept = [name for name in table.column_names if not name.startswith(_DIFFERS)]
+    found: list[Mapping[str, Any]] = table.select(kept).to_pylist()
+    return found

@@ -1,0 +1,43 @@
+"""Processes that die take nothing with them but the run that ends them; a Dask cluster gives the same rows."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cheap_study import Cheap, study
+
+from femoreg_torch.errors import InputError
+from sim.study.executors import OnCluster, OnThisMachine
+from sim.study.rows import TABLE_NAME, comparable, read_table
+from sim.study.study import run_study
+
+
+def rows(out: Path) -> list[Any]:
+    return comparable(read_table(out / TABLE_NAME))
+
+
+@pytest.mark.long
+def test_a_run_that_kills_its_process_is_given_up_and_the_others_are_made(tmp_path: Path) -> None:
+    told = run_study(study(6, Cheap(deadly=2)), tmp_path, OnThisMachine(2))
+    assert told.status == {"done": 5, "failed": 1}
+    assert told.first_failure == "plain, procedure 2: its process was killed, perhaps for lack of memory"
+    run_study(study(6, Cheap()), tmp_path, OnThisMachine(1))
+    assert {row["status"] for row in rows(tmp_path)} == {"done"}
+
+
+@pytest.mark.long
+def test_a_cluster_gives_the_same_rows_and_survives_a_killed_worker(tmp_path: Path) -> None:
+    run_study(study(40, Cheap()), tmp_path / "here", OnThisMachine(1))
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        work = Cheap(deadly=5, once=tmp_path / "killed")
+        run_study(study(40, work), tmp_path / "there", OnCluster(cluster.scheduler_address))
+    assert (tmp_path / "killed").exists()
+    assert rows(tmp_path / "there") == rows(tmp_path / "here")
+
+
+def test_a_cluster_that_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("sim.study.executors.PATIENCE", "1s")
+    with pytest.raises(InputError, match=r"--scheduler tcp://127.0.0.1:9: does not answer"):
+        run_study(study(1, Cheap()), tmp_path, OnCluster("tcp://127.0.0.1:9"))
