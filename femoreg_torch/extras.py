@@ -8,6 +8,8 @@ _EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
     "lightning": "train",
     "tensorboard": "train",
     "joblib": "study",
+    "pandas": "study",
+    "pyarrow": "study",
     "matplotlib": "all",  # in both `train` and `study`
 }
 
