@@ -132,6 +132,9 @@ def html(table: Table) -> str:
     return f'<h3>{escape(table.title)}</h3><div class="wide">{body}</div>{note}'
 
 
+_WORD = 18  # letters
+
+
 def for_terminal(table: Table) -> RichTable:
     """For a rich console."""
     shown = RichTable(
@@ -143,8 +146,10 @@ def for_terminal(table: Table) -> RichTable:
         padding=(0, 1, 0, 0),
     )
     for place, column in enumerate(table.columns):
-        text = place < table.texts
-        shown.add_column(escape_markup(column), justify="left" if text else "right", no_wrap=text)
+        side: Literal["left", "right"] = "left" if place < table.texts else "right"
+        words = [word for row in table.rows for word in row[place].split()]
+        longest = max(map(len, words), default=0)  # so that no number and no name is ever broken or cut
+        shown.add_column(escape_markup(column), justify=side, overflow="fold", min_width=min(longest, _WORD))
     for row in table.rows:
         shown.add_row(*map(escape_markup, row), style="dim" if of_paper(row) else "")
     return shown

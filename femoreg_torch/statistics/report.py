@@ -161,7 +161,7 @@ def _untrusted(rows: pd.DataFrame) -> Iterator[str]:
     wrong = run_is_wrong(rows)
     outcomes = chosen["status"].where(chosen["status"].ne(DONE), "flagged")
     reasons = chosen["reason"].where(chosen["reason"].ne(""), chosen["reasons"])
-    kinds = reasons.str.replace(r"\d[\d.,]*", "…", regex=True)  # the same reason with other numbers
+    kinds = reasons.str.replace(r"\S*/\S*[^\s:;,.]|\d[\d.,]*", "…", regex=True)  # the same with other files and numbers
     counts = pd.DataFrame({"outcome": outcomes, "reason": kinds}).value_counts()
     yield "<h3>How often, and why</h3>"
     yield listing(("runs", "", "reason"), [(str(count), *map(str, key)) for key, count in counts.items()])

@@ -110,10 +110,11 @@ def folder_name(condition: str) -> str:
 def varied(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """The columns of what was varied, with the runs to compare: at least two values, None where nothing was varied.
 
-    These are the runs that have a value, and beside them those of conditions that vary nothing at all.
+    These are the runs that have a value, and beside them those that have none in any column that only some runs have.
     """
     columns = [column for column in rows if column.startswith(VARIED)]
-    plain = rows[columns].isna().all(axis=1)
+    partial = [column for column in columns if rows[column].isna().any()]
+    plain = rows[partial].isna().all(axis=1)
     parts = {column: rows[rows[column].notna() | plain] for column in columns}
     return {column: part for column, part in parts.items() if part[column].nunique(dropna=False) > 1}
 

@@ -182,6 +182,18 @@ def test_cells() -> None:
     assert between((math.nan, math.nan), 2) == "–"
 
 
+def test_numbers_are_whole_in_a_terminal_of_80_columns() -> None:
+    console = Console(width=80, record=True, file=io.StringIO())
+    tables = group_tables(refuse(made_up(100, scale=0.1), [3, 4]), 0)
+    for table in tables:
+        console.print(for_terminal(table))
+    text = console.export_text()
+    assert "…" not in text
+    words = set(text.split())
+    for table in tables:
+        assert {word for row in table.rows for cell in row[1:] for word in cell.split()} <= words
+
+
 def test_files_html_and_terminal(tmp_path: Path) -> None:
     write_tables([ODD], tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["odd.csv", "odd.md", "odd.tex"]
