@@ -19,7 +19,9 @@ OBJECTS = ("pelvis", "femur", "device")  # those of POSES that a run states a de
 PELVIS_AT_HEAD = "pelvis_at_head_mm"  # optional: displacement of the pelvis at the femoral head, as in Figure 9
 
 _PAPER = load_preset("paper", "gao2020")
-PAPER_TRIALS: dict[str, list[float]] = _PAPER["cadaver"]  # Table III: column to the values of six trials
+_CADAVER = load_preset("paper", "gao2020_cadaver")
+PAPER_TRIALS: dict[str, list[float]] = _CADAVER["metrics"]  # Table III: column to the values of its trials
+PAPER_TRIAL_NAMES: list[str] = _CADAVER["trials"]
 PAPER_CORRELATIONS: dict[str, float] = _PAPER["correlations"]  # of `pelvis_at_head_mm` with these columns
 
 

@@ -5,16 +5,14 @@ import pandas as pd
 
 from femoreg_torch.statistics.formats import PAPER, Table, number, plus_minus
 from femoreg_torch.statistics.outcome import told
-from femoreg_torch.statistics.quantities import METRICS, PAPER_TRIALS
-
-_NUMERALS = ("I", "II", "III", "IV", "V", "VI")  # of the paper's trials
+from femoreg_torch.statistics.quantities import METRICS, PAPER_TRIAL_NAMES, PAPER_TRIALS
 
 
 def trial_table(rows: pd.DataFrame) -> Table:
     """A column for every trial, named by its condition; below each row the paper's trials."""
     lines, data = [], []
     trials = [str(name) for name in rows["condition"]]
-    columns = max(len(trials), len(_NUMERALS))
+    columns = max(len(trials), len(PAPER_TRIAL_NAMES))
     for quantity in METRICS:
         values = told(rows, quantity.column).to_numpy(float)
         paper = np.array(PAPER_TRIALS[quantity.column])
@@ -22,7 +20,11 @@ def trial_table(rows: pd.DataFrame) -> Table:
             continue
         lines += [
             (quantity.label, _mean(values, quantity.digits), *_cells(values, quantity.digits, columns)),
-            (f"{PAPER} ({_NUMERALS[0]} to {_NUMERALS[-1]})", _mean(paper, 2), *_cells(paper, 2, columns)),
+            (
+                f"{PAPER} ({PAPER_TRIAL_NAMES[0]} to {PAPER_TRIAL_NAMES[-1]})",
+                _mean(paper, 2),
+                *_cells(paper, 2, columns),
+            ),
         ]
         data += [
             {"error": quantity.column, "unit": quantity.unit, "trial": trial, "value": value}

@@ -11,7 +11,10 @@ import pytest
 from study_frames import made_up, refuse
 
 from femoreg_torch.commands.main import main
+from femoreg_torch.statistics.figures import Picture
+from femoreg_torch.statistics.report import report_page
 from femoreg_torch.statistics.rows import read_rows, run_name, write_rows
+from femoreg_torch.statistics.study import study_tables
 
 
 class Page(HTMLParser):
@@ -53,7 +56,10 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_report_is_one_page_that_loads_nothing(folder: Path) -> None:
-    worst = read_rows(folder / "runs.parquet").set_index("relative_mm").loc[7.5]
+    rows = read_rows(folder / "runs.parquet")
+    rows["condition"] = "plain"
+    write_rows(rows, folder / "runs.parquet")
+    worst = rows.set_index("relative_mm").loc[7.5]
     (folder / "overlays").mkdir()
     cv2.imwrite(str(folder / "overlays" / f"{run_name(worst)}.png"), np.full((20, 30, 3), 90, np.uint8))
     assert main(["report", str(folder)]) == 0
@@ -80,6 +86,19 @@ def test_the_report_is_one_page_that_loads_nothing(folder: Path) -> None:
     assert "histograms.png" in figures
     assert "histograms.svg" in figures
     assert len(page.references) == len(list((folder / "figures").glob("*/*.png"))) + 1  # and one overlay
+
+
+def test_every_condition_has_its_tables_and_figures_on_the_page(folder: Path) -> None:
+    rows = read_rows(folder / "runs.parquet")
+    groups = ("all", "harder", "plain")
+    pictures = {name: [Picture("histograms", f"drawn of {name}", "told below", b"png")] for name in groups}
+    page = Page(report_page(rows, study_tables(rows, 0), [], pictures, folder))
+    for name in groups:
+        assert f"drawn of {name}" in page.text
+    assert page.text.count("told below") == 3
+    assert page.text.count("Errors that steer the drill") == 3
+    assert page.text.index("Conditions") < page.text.index("drawn of harder") < page.text.index("Worst cases")
+    assert "All 3 of 22 runs" in page.text
 
 
 def test_tables_are_printed_and_written_and_old_ones_go(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
