@@ -81,7 +81,13 @@ def test_what_is_in_no_extra_is_not_spoken_of() -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "extras"), [(["phantom"], {"sim"}), (["train", "quick.yaml", "--out"], {"sim", "train", "all"})]
+    ("command", "extras"),
+    [
+        (["phantom"], {"sim"}),
+        (["train", "quick.yaml", "--out"], {"sim", "train", "all"}),
+        (["tables"], {"study"}),
+        (["report"], {"study", "all"}),
+    ],
 )
 def test_a_command_without_its_extra_says_so_in_one_line(tmp_path: Path, command: list[str], extras: set[str]) -> None:
     done = run_without_extras(COMMAND.format([*command, str(tmp_path / "out")]))

@@ -1,0 +1,27 @@
+"""Figures of a group of runs, in the sizes of a journal's page."""
+
+import pandas as pd
+from matplotlib import rc_context
+
+from femoreg_torch.statistics.figures.correlations import correlations
+from femoreg_torch.statistics.figures.deviations import deviations
+from femoreg_torch.statistics.figures.distributions import distributions
+from femoreg_torch.statistics.figures.histograms import histograms
+from femoreg_torch.statistics.figures.origins import origins
+from femoreg_torch.statistics.figures.style import STYLE, Picture, Plot, write_figures
+from femoreg_torch.statistics.figures.varied import varied_figures
+
+__all__ = ["Picture", "Plot", "all_figures", "paper_figures", "write_figures"]
+
+
+def all_figures(rows: pd.DataFrame) -> list[Plot]:
+    """All figures that the runs of a study can fill."""
+    with rc_context(STYLE):
+        plots = [distributions(rows), deviations(rows), origins(rows)]
+        return paper_figures(rows) + [plot for plot in plots if plot is not None] + varied_figures(rows)
+
+
+def paper_figures(rows: pd.DataFrame) -> list[Plot]:
+    """The paper's Figures 8 and 9 of a group of runs, as far as these can fill them."""
+    with rc_context(STYLE):
+        return [plot for plot in (histograms(rows), correlations(rows)) if plot is not None]

@@ -1,0 +1,104 @@
+"""Intervals of 95 %: of means and differences by the bootstrap, of rates, and of correlations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import binomtest, bootstrap, norm, pearsonr, spearmanr
+
+RESAMPLES = 2000
+_LEVEL = 0.95
+_BATCH_VALUES = 4_000_000  # resampled at once, 32 MB
+
+Interval = tuple[float, float]
+UNKNOWN: Interval = (float("nan"), float("nan"))
+
+
+def mean_interval(values: ArrayLike, seed: int) -> Interval:
+    """Of the mean of independent values: bootstrap, bias-corrected and accelerated (Efron, JASA 82 (1987) 171).
+
+    nan for fewer than two values, and for values that are all the same.
+    """
+    sample = np.asarray(values, float)
+    if len(sample) < 2 or np.ptp(sample) == 0:
+        return UNKNOWN  # a sample without spread says nothing about the spread
+    return _bootstrap((sample,), _mean, seed)
+
+
+def difference_interval(first: ArrayLike, second: ArrayLike, seed: int) -> Interval:
+    """Of the mean of `first` less that of `second`, two independent samples."""
+    samples = np.asarray(first, float), np.asarray(second, float)
+    if min(map(len, samples)) < 2 or any(np.ptp(sample) == 0 for sample in samples):
+        return UNKNOWN
+    return _bootstrap(samples, _difference, seed)
+
+
+def _mean(values: np.ndarray, axis: int) -> np.ndarray:
+    return values.mean(axis)
+
+
+def _difference(first: np.ndarray, second: np.ndarray, axis: int) -> np.ndarray:
+    return first.mean(axis) - second.mean(axis)
+
+
+def _bootstrap(samples: tuple[np.ndarray, ...], statistic: object, seed: int) -> Interval:
+    batch = max(1, _BATCH_VALUES // max(map(len, samples)))
+    found = bootstrap(
+        samples,
+        statistic,
+        n_resamples=RESAMPLES,
+        batch=batch,
+        vectorized=True,
+        confidence_level=_LEVEL,
+        method="BCa",
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return float(found.low), float(found.high)
+
+
+def rate_interval(successes: int, trials: int) -> Interval:
+    """Of a rate (Wilson, JASA 22 (1927) 209)."""
+    if trials == 0:
+        return UNKNOWN
+    found = binomtest(successes, trials).proportion_ci(_LEVEL, method="wilson")
+    return float(found.low), float(found.high)
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """A coefficient, its interval, and the number of pairs that it is made of."""
+
+    value: float
+    interval: Interval
+    count: int
+
+
+def pearson(x: ArrayLike, y: ArrayLike) -> Correlation:
+    """Of the pairs that are both finite; the interval by Fisher's transform. nan for fewer than four, or constants."""
+    x, y = _pairs(x, y)
+    if not _varies(x, y):
+        return Correlation(float("nan"), UNKNOWN, len(x))
+    found = pearsonr(x, y)
+    interval = found.confidence_interval(_LEVEL)
+    return Correlation(float(found.statistic), (float(interval.low), float(interval.high)), len(x))
+
+
+def spearman(x: ArrayLike, y: ArrayLike) -> Correlation:
+    """As `pearson`, of ranks; the variance of the transform after Bonett & Wright, Psychometrika 65 (2000) 23."""
+    x, y = _pairs(x, y)
+    if not _varies(x, y):
+        return Correlation(float("nan"), UNKNOWN, len(x))
+    value = float(spearmanr(x, y).statistic)
+    half = norm.ppf((1 + _LEVEL) / 2) * np.sqrt((1 + value**2 / 2) / (len(x) - 3))
+    middle = np.arctanh(np.clip(value, -1 + 1e-12, 1 - 1e-12))
+    return Correlation(value, (float(np.tanh(middle - half)), float(np.tanh(middle + half))), len(x))
+
+
+def _pairs(x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    both = np.isfinite(x) & np.isfinite(y)
+    return x[both], y[both]
+
+
+def _varies(x: np.ndarray, y: np.ndarray) -> bool:
+    return len(x) > 3 and np.ptp(x) > 0 and np.ptp(y) > 0
