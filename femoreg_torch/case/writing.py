@@ -48,7 +48,8 @@ def write_case(folder: Path, case: Case) -> None:
     if case.views:
         content["views"] = [_view(view, folder, case.template is not None) for view in case.views]
     if case.truth is not None:
-        write_json(folder / "truth.json", poses_content(case.truth, case.anchor))
+        told_by = case.anchor if case.anchor in case.truth.camera1_from else next(iter(case.truth.camera1_from))
+        write_json(folder / "truth.json", poses_content(case.truth, told_by))
         content["truth"] = "truth.json"
     text = yaml.safe_dump(plain(content), sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
     write_text(folder / "case.yaml", text)
