@@ -15,6 +15,7 @@ With one view this does the same. Several views, the beads' own deviations, and 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -142,6 +143,11 @@ def _robust(residuals_px: Array, jacobian: Array, sigma: float) -> float:
     return max(_LEAST_PX, float(1.4826 * np.median(np.abs(residuals_px)) / np.sqrt(share)))
 
 
+def _by_twist(arms: Tensor) -> Tensor:
+    """Derivatives (S, 3, 6) of places by a twist (rad, mm) about a centre; `arms` (S, 3) from there."""
+    return torch.cat([-skew(arms), torch.eye(3, dtype=torch.float64).expand(len(arms), 3, 3)], 2)
+
+
 @dataclass(frozen=True, eq=False)
 class _State:
     """Where everything is taken to be."""
@@ -159,28 +165,38 @@ class _Problem:
     camera: Camera
     views: int
 
-    @property
+    @cached_property
     def names(self) -> list[str]:
         """The objects."""
         return [thing.object for thing in self.beads]
 
-    @property
+    @cached_property
     def object_of(self) -> NDArray[np.int64]:
         """The object (S,) of every sight."""
         return np.array([self.names.index(sight.object) for sight in self.sights])
 
-    @property
+    @cached_property
     def view_of(self) -> NDArray[np.int64]:
         """The view (S,) of every sight."""
         return np.array([sight.view for sight in self.sights])
 
-    @property
+    @cached_property
     def bead_of(self) -> NDArray[np.int64]:
         """Among all beads, that (S,) of every sight."""
         first = np.cumsum([0, *(len(thing) for thing in self.beads)])
         return first[self.object_of] + np.array([sight.bead for sight in self.sights])
 
-    @property
+    @cached_property
+    def points(self) -> Tensor:
+        """Of all beads (N, 3), mm in their objects."""
+        return torch.cat([thing.points for thing in self.beads])
+
+    @cached_property
+    def seen(self) -> Tensor:
+        """Pixels (S, 2)."""
+        return torch.tensor([sight.pixel for sight in self.sights], dtype=torch.float64)
+
+    @cached_property
     def deviations_mm(self) -> Array:
         """Of the place of each bead (N,)."""
         return np.concatenate([np.full(len(thing), thing.deviation_mm) for thing in self.beads])
@@ -223,7 +239,7 @@ class _Problem:
 
     def places(self, state: _State) -> tuple[Tensor, Tensor]:
         """The bead (S, 3) of every sight in camera 1, and in its own camera."""
-        points = torch.cat([thing.points for thing in self.beads]) + state.shifts
+        points = self.points + state.shifts
         poses = torch.stack([state.poses.camera1_from[name] for name in self.names])[self.object_of]
         first = transform_points(poses, points[self.bead_of][:, None])
         own = transform_points(state.poses.camera_from_camera1[self.view_of], first)
@@ -231,32 +247,34 @@ class _Problem:
 
     def residuals_px(self, state: _State) -> Array:
         """Drawn minus seen (S, 2)."""
-        drawn = project_points(self.camera, self.places(state)[1])
-        return (drawn - drawn.new_tensor([sight.pixel for sight in self.sights])).numpy()
+        return (project_points(self.camera, self.places(state)[1]) - self.seen).numpy()
 
     def jacobian_px(self, state: _State) -> Array:
         """Derivatives (S, 2, unknowns) of the drawn pixels by all unknowns."""
         first, own = self.places(state)
         centres = self.centres(state)
-        eye = torch.eye(3, dtype=torch.float64)
-        plane = torch.cat([eye[:2, :2].expand(len(own), 2, 2), -own[:, :2, None] / own[:, 2:, None]], 2)
+        eye = torch.eye(2, dtype=torch.float64)
+        plane = torch.cat([eye.expand(len(own), 2, 2), -own[:, :2, None] / own[:, 2:, None]], 2)
         across = self.camera.matrix()[:2, :2] @ plane / own[:, 2:, None]  # (S, 2, 3), by the place in the own camera
-        turns = state.poses.camera_from_camera1[self.view_of][:, :3, :3]
+        by_first = across @ state.poses.camera_from_camera1[self.view_of][:, :3, :3]
+        objects = len(self.names)
         free = np.flatnonzero(self.deviations_mm > 0)
-        column = {int(bead): 6 * len(centres) + 3 * n for n, bead in enumerate(free)}
-        jacobian = torch.zeros(len(own), 2, 6 * len(centres) + 3 * len(free), dtype=torch.float64)
-        for row, (thing, view, bead) in enumerate(zip(self.object_of, self.view_of, self.bead_of, strict=True)):
-            by_first = across[row] @ turns[row]
-            arm = first[row] - centres[thing]
-            jacobian[row, :, 6 * thing : 6 * thing + 6] = by_first @ torch.cat([-skew(arm), eye], 1)
-            if view:
-                at = 6 * (len(self.names) + view - 1)
-                arm = own[row] - centres[len(self.names) + view - 1]
-                jacobian[row, :, at : at + 6] = across[row] @ torch.cat([-skew(arm), eye], 1)
-            if int(bead) in column:
-                turn = state.poses.camera1_from[self.names[thing]][:3, :3]
-                jacobian[row, :, column[int(bead)] : column[int(bead)] + 3] = by_first @ turn
-        return jacobian.numpy()
+        jacobian = np.zeros((len(own), 2, 6 * len(centres) + 3 * len(free)))
+        rows = np.arange(len(own))
+
+        def put(rows: NDArray[np.int64], first_column: NDArray[np.int64], block: Tensor) -> None:
+            columns = first_column[:, None] + np.arange(block.shape[2])
+            jacobian[rows[:, None], :, columns] = block.mT.numpy()
+
+        put(rows, 6 * self.object_of, by_first @ _by_twist(first - centres[self.object_of]))
+        later = np.flatnonzero(self.view_of)
+        number = objects + self.view_of[later] - 1
+        put(later, 6 * number, across[later] @ _by_twist(own[later] - centres[number]))
+        shifted = np.flatnonzero(self.deviations_mm[self.bead_of] > 0)
+        turns = torch.stack([state.poses.camera1_from[name][:3, :3] for name in self.names])[self.object_of[shifted]]
+        place = np.searchsorted(free, self.bead_of[shifted])
+        put(shifted, 6 * len(centres) + 3 * place, by_first[shifted] @ turns)
+        return jacobian
 
     def solved(
         self, state: _State, used: NDArray[np.bool_], sigma: float, robust: bool = False

@@ -24,8 +24,10 @@ _WINDOW_MM = 2.5  # of the fit beyond the bead's radius
 _BLUR_MM = (0.15, 1.1)  # standard deviation of scanner and voxel together: half a voxel of 0.5 mm, a soft kernel
 _OBLONG = 1.7  # most by which a bead is longer than wide, of its blurred deviations
 _EXPLAINED = 0.80  # least share of the variance in the window that the fit explains
-_CANDIDATES = 300  # that are fitted, those that stand out most first
-_RIVAL = 0.5  # of the faintest bead's mass: what comes close to it makes the count doubtful
+_CANDIDATES = 100  # that are fitted, those that stand out most first
+_RIVAL = 0.5  # of the faintest bead: what comes as close to it makes the count doubtful
+_STEPS = 30  # of a fit
+_SPREAD_MM = 1.6  # by which blur widens a bead on each side, where it is half as bright as a clipped middle
 _CLIPPED = 3  # voxels at the largest value, from which on that is where the scanner clips
 
 
@@ -56,10 +58,15 @@ def find_beads(ct: Volume, diameter_mm: float, count: int, within: Tensor | None
     largest = float(part.max())
     clip = largest if (part >= largest).sum() >= _CLIPPED else np.inf
     found: list[Array] = []  # (x, y, z index, mass)
-    for z, y, x in index:
+    contrasts = stands_out[tuple((index - low).T)]
+    faintest = np.inf
+    for (z, y, x), contrast in zip(index, contrasts, strict=True):
+        if len(found) >= count and contrast < _RIVAL * faintest:
+            break  # nothing that follows can be taken for a bead
         spot = _fitted(data, np.array([x, y, z]), spacing, diameter_mm, clip)
         if spot is not None and all(np.linalg.norm((spot[:3] - o[:3]) * spacing) > diameter_mm for o in found):
             found.append(spot)
+            faintest = min(faintest, contrast)
     found.sort(key=lambda spot: -spot[3])
     if len(found) < count:
         raise InputError(
@@ -98,6 +105,8 @@ def _fitted(data: NDArray[np.floating], start: Array, spacing: Array, diameter_m
     z, y, x = np.mgrid[-half[2] : half[2] + 1, -half[1] : half[1] + 1, -half[0] : half[0] + 1]
     places = np.stack([x, y, z], -1) * spacing  # mm from the voxel
     chosen = (np.linalg.norm(places, axis=-1) <= reach) & (part < clip)
+    if not _small(part, places, diameter_mm):
+        return None
     places, values = places[chosen], part[chosen]
     plane = np.column_stack([np.ones(len(values)), places])
     if len(values) < 20:
@@ -112,9 +121,11 @@ def _fitted(data: NDArray[np.floating], start: Array, spacing: Array, diameter_m
     ball = diameter_mm / 2 / np.sqrt(5)  # deviation of a full sphere along an axis
     lowest, highest = (float(np.hypot(ball, blur)) for blur in _BLUR_MM)
     first = np.array([0.0, 0, 0, *np.hypot(ball, np.maximum(0.5, spacing / 2))])
-    edge = float(spacing.max())
+    edge = float(spacing.max()) + diameter_mm / 2  # a clipped bead is a plateau, which may begin at its rim
     bounds = ([-edge] * 3 + [lowest] * 3, [edge] * 3 + [highest] * 3)
-    fit = least_squares(lambda p: solved(p)[0], first.clip(*bounds), bounds=bounds, x_scale=0.1, xtol=1e-6)
+    fit = least_squares(
+        lambda p: solved(p)[0], first.clip(*bounds), bounds=bounds, x_scale=0.1, xtol=1e-5, max_nfev=_STEPS
+    )
     residuals, height = solved(fit.x)
     sizes = fit.x[3:]
     explained = 1 - float((residuals**2).sum()) / max(float(((values - values.mean()) ** 2).sum()), 1e-9)
@@ -127,3 +138,14 @@ def _fitted(data: NDArray[np.floating], start: Array, spacing: Array, diameter_m
         return None
     mass = height * (2 * np.pi) ** 1.5 * float(np.prod(sizes))
     return np.array([*(start + fit.x[:3] / spacing), mass])
+
+
+def _small(part: Array, places: Array, diameter_mm: float) -> bool:
+    """Whether what is more than half as bright as the middle takes no more room than a bead; `part` is its window."""
+    distance = np.linalg.norm(places, axis=-1)
+    level = float(np.median(part[distance > distance.max() - 1.0 - diameter_mm / 2]))
+    height = float(part[distance <= diameter_mm].max()) - level
+    voxel = float(np.prod([places[1, 1, 1, n] - places[0, 0, 0, n] for n in range(3)]))
+    room = np.pi / 6 * (diameter_mm + 2 * _SPREAD_MM) ** 3
+    inside = distance <= diameter_mm / 2 + _WINDOW_MM
+    return height > _ABOVE_HU and float((part[inside] > level + height / 2).sum()) * voxel <= room

@@ -34,7 +34,7 @@ _WIDE = 3.0  # times as far by a pose from three others, whose errors it carries
 _DEPTHS = (0.2, 1.0)  # of the source-to-detector distance: beads lie between source and detector
 _GUESSES = 150_000  # at most: some four seconds
 _REFINED = 12  # best guesses that are fitted
-_CHANCE = 1e-3  # matches as good that chance may be expected to make
+_CHANCE = 0.05  # matches as good that chance may be expected to make: a level of 5 %
 _ALIKE = 3.0  # a rival with as many beads must fit worse by this factor
 _FLOOR_PX = 0.3  # of residuals that are compared
 

@@ -44,10 +44,10 @@ def write_measured(out: Path, case: Case, found: Measured) -> None:
     Of one view alone the truth holds that view. Raises `InputError` for a case whose images cannot be written anew.
     """
     with new_folder(out) as folder:
-        views = tuple(_clean_view(folder, case, found, number) for number in range(len(case.views)))
-        ct_path = _clean_ct(folder, case, found)
-        cleaned = replace(case, folder=folder, views=views, ct_path=ct_path, truth=found.bundle.poses)
-        write_case(folder, cleaned)
+        views = tuple(_clean_view(folder, out, case, found, number) for number in range(len(case.views)))
+        ct_path = _clean_ct(folder, out, case, found)
+        cleaned = replace(case, folder=out, views=views, ct_path=ct_path, truth=found.bundle.poses)
+        write_case(folder, cleaned, standing=out)
         write_json(folder / UNCERTAINTY_NAME, uncertainty_content(case, found))
         _write_table(folder / BEADS_NAME, found)
         picture = beads_picture(case, found)
@@ -101,7 +101,7 @@ def _write_table(path: Path, found: Measured) -> None:
             )
 
 
-def _clean_view(folder: Path, case: Case, found: Measured, number: int) -> View:
+def _clean_view(folder: Path, out: Path, case: Case, found: Measured, number: int) -> View:
     """The images of a view without the beads that they show; those of a view that nothing places stay as they are."""
     view, images = case.views[number], {}
     for kind, path in view.images.items():
@@ -109,8 +109,9 @@ def _clean_view(folder: Path, case: Case, found: Measured, number: int) -> View:
         image = image_without(read_image(path), centres, radii, case.carm.camera)
         if view.intensity != "raw" or image.min() < 0 or image.max() > 65535:
             raise InputError(f"{path}: raw images of 16 bits are written without beads; this one is none.")
-        images[kind] = folder / f"view{number + 1}_{kind}.tif"
-        write_image(images[kind], image.round().to(torch.uint16))
+        name = f"view{number + 1}_{kind}.tif"
+        write_image(folder / name, image.round().to(torch.uint16))
+        images[kind] = out / name
     return replace(view, images=images)
 
 
@@ -125,7 +126,7 @@ def _shadows(case: Case, found: Measured, number: int, kind: str) -> tuple[Tenso
     return centres, radii
 
 
-def _clean_ct(folder: Path, case: Case, found: Measured) -> Path | None:
+def _clean_ct(folder: Path, out: Path, case: Case, found: Measured) -> Path | None:
     """The CT without the beads of its bones; the same file where it has none."""
     inside = [thing for thing in found.beads if case.objects[thing.object].model is None]
     if case.ct_path is None or not inside:
@@ -134,7 +135,7 @@ def _clean_ct(folder: Path, case: Case, found: Measured) -> Path | None:
     for thing in inside:
         ct = ct_without(ct, thing.points, thing.diameter_mm)
     write_volume(folder / CT_NAME, ct)
-    return folder / CT_NAME
+    return out / CT_NAME
 
 
 def beads_picture(case: Case, found: Measured) -> np.ndarray:
