@@ -179,16 +179,22 @@ def with_known_poses(views: tuple[View, ...], top: Fields) -> tuple[View, ...]:
 
 
 def read_truth(top: Fields, folder: Path, objects: list[str], views: int) -> Poses | None:
-    """Known poses of all objects, or None."""
+    """Known poses, or None: of all objects, or, where the first one's are not known, of some.
+
+    In the second case another object tells the C-arm's poses, in all views or in the first alone.
+    """
     if "truth" not in top:
         return None
     path = top.file_path("truth", folder)
-    anchor, *others = objects
-    known = (f"camera_from_{anchor}", *(f"camera1_from_{name}" for name in others))
-    fields = Fields(read_json(path), str(path)).only(*known)
-    truth = poses_from(fields, anchor, others)
-    if views and len(truth.camera_from_camera1) != views:
-        raise InputError(
-            f"{fields.where(known[0])}: {len(truth.camera_from_camera1)} poses, but the case has {views} views."
-        )
+    fields = Fields(read_json(path), str(path))
+    told = [name for name in objects if f"camera_from_{name}" in fields] or objects[:1]
+    leader = told[0]
+    others = [name for name in objects if name != leader]
+    fields.only(f"camera_from_{leader}", *(f"camera1_from_{name}" for name in others if name != objects[0]))
+    if leader != objects[0]:
+        others = [name for name in others if f"camera1_from_{name}" in fields]
+    truth = poses_from(fields, leader, others)
+    count = len(truth.camera_from_camera1)
+    if views and count != views and (leader == objects[0] or count != 1):
+        raise InputError(f"{fields.where(f'camera_from_{leader}')}: {count} poses, but the case has {views} views.")
     return truth

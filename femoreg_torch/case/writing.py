@@ -22,33 +22,35 @@ from femoreg_torch.geometry import CArm, load_carm
 from femoreg_torch.volume import write_landmarks
 
 
-def write_case(folder: Path, case: Case) -> None:
+def write_case(folder: Path, case: Case, standing: Path | None = None) -> None:
     """Write `case.yaml` and what it refers to as text; volumes, images and models must stand in place.
 
-    Paths are written relative to `folder`, which must exist. `case.folder` is not looked at.
+    Paths are written relative to `folder`, which must exist, or to where it will be `standing` once it is whole; the
+    case then names its files as they will stand there. `case.folder` is not looked at.
     """
-    folder = Path(folder).resolve()
+    folder, base = Path(folder).resolve(), Path(standing or folder).resolve()
     content: dict[str, Any] = {"version": VERSIONS[-1]}
     if case.template is not None:
         content |= {"template": case.template, "side": case.side}
     elif case.anatomy is not None:
         content["anatomy"] = case.anatomy.name
     if case.ct_path is not None:
-        content["ct"] = _ct(case, folder)
+        content["ct"] = _ct(case, base)
     if case.landmarks:
         write_landmarks(folder / "landmarks.json", case.landmarks)
         content["landmarks"] = "landmarks.json"
     if case.template is not None:
-        content |= _femoroplasty(case, folder)
+        content |= _femoroplasty(case, base)
     else:
-        content["objects"] = {name: _object(thing, folder) for name, thing in case.objects.items()}
+        content["objects"] = {name: _object(thing, base) for name, thing in case.objects.items()}
         if case.plan is not None:
             content["plan"] = _plan(case.plan)
     content["carm"] = _carm(case.carm)
     if case.views:
-        content["views"] = [_view(view, folder, case.template is not None) for view in case.views]
+        content["views"] = [_view(view, base, case.template is not None) for view in case.views]
     if case.truth is not None:
-        write_json(folder / "truth.json", poses_content(case.truth, case.anchor))
+        told_by = case.anchor if case.anchor in case.truth.camera1_from else next(iter(case.truth.camera1_from))
+        write_json(folder / "truth.json", poses_content(case.truth, told_by))
         content["truth"] = "truth.json"
     text = yaml.safe_dump(plain(content), sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
     write_text(folder / "case.yaml", text)

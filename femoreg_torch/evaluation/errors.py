@@ -57,8 +57,10 @@ def errors(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, 
     deg_xyz}` with the displacement of the reference point (of a view: of its source) and the axis angle, and signed
     along IS, LR, AP, the rotation as xyz Euler angles. Of a planned path: `entry_point_mm` (9), `tip_mm` (10),
     `relative_mm` (11), `path_deg` (12), `guide_deg` (13); what needs a tool is left out where truth or estimate has
-    none. Raises `InputError` if the numbers of views differ.
+    none. A truth of one view is compared with the first. Raises `InputError` if the numbers of views differ otherwise.
     """
+    if len(truth.camera_from_camera1) == 1:
+        estimate = estimate.first_views(1)
     counts = len(truth.camera_from_camera1), len(estimate.camera_from_camera1)
     if counts[0] != counts[1]:
         raise InputError(

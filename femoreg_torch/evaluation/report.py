@@ -24,6 +24,12 @@ img { max-width: 100%; } figcaption { color: #4b5866; }
 """
 _NOTICE = "Research software, not a medical device: its output must not guide the treatment of a patient."
 _SIMULATED = "The images of this case are simulated, and so is the truth that the errors are measured against."
+_MEASURED = "The truth that the errors are measured against was itself measured, by beads, and has an error of its own."
+
+
+def _origin(case: Case) -> str:
+    """Where a truth is from: only a simulation knows where the anchor is."""
+    return _SIMULATED if case.truth is not None and case.anchor in case.truth.camera1_from else _MEASURED
 
 
 def report_page(case: Case, result: Result, errors: dict[str, Any] | None, overlay: Picture) -> str:
@@ -35,7 +41,7 @@ def report_page(case: Case, result: Result, errors: dict[str, Any] | None, overl
     parts = [
         f"<h1>Registration of {escape(case.folder.resolve().name)}</h1>",
         f"<p>{escape(side)}{len(case.views)} views, preset <b>{escape(result.preset)}</b>, seed {result.seed}</p>",
-        f'<p class="notice">{_NOTICE}{" " + _SIMULATED if case.truth is not None else ""}</p>',
+        f'<p class="notice">{_NOTICE}{" " + _origin(case) if case.truth is not None else ""}</p>',
         _verdict(result.verdict),
         _skipped(result.skipped),
     ]

@@ -73,11 +73,13 @@ def view_images(
     model: XrayModel,
     generator: torch.Generator,
     report: Callable[[str], None],
+    on_device: Callable[[Tensor], Mapping[str, Tensor]] | None = None,
 ) -> list[ViewImages]:
     """Images of all views of a procedure.
 
     `body` tells the patient's mass per area (H, W) in g/cm² of each material, seen from a pose `camera_from_lps`
-    (4, 4). `report` is told each view before it starts.
+    (4, 4), and `on_device`, if given, that of what is fixed to the device, from `camera_from_device`. `report` is told
+    each view before it starts.
     """
     poses = procedure.camera_from_pelvis
     camera_from_camera1 = poses @ invert_rigid(poses[0])
@@ -86,6 +88,8 @@ def view_images(
         report(f"imaging view {number + 1} of {len(poses)}")
         table = areal_solids(metal.table, camera_from_camera1[number], camera, step_mm)
         device = areal_solids(metal.device, procedure.camera_from_device[number], camera, step_mm)
+        if on_device is not None:
+            device = together(device, on_device(procedure.camera_from_device[number]))
         still = body(pose)
         later = still if procedure.lps_moved is None else body(pose @ procedure.lps_moved)
         anatomy_image = fluoroscopy(together(still, table), camera, model, generator)

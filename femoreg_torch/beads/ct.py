@@ -1,0 +1,151 @@
+"""Beads in a CT: small round spots brighter than bone, their centres measured to a fraction of a voxel.
+
+A bead of 1 mm is about as large as a voxel, so what the CT shows is its blur: nearly a Gaussian, whose centre is fitted
+to all voxels within some millimetres, over a plane for the bone around. Voxels that the scanner has clipped are left
+out. The paper labelled its beads in the CT by hand (section III-B).
+"""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import transform_points
+from femoreg_torch.volume import Volume
+
+Array = NDArray[np.float64]
+
+_ABOVE_HU = 700.0  # over the tissue around: trabecular bone stays 300 below its neighbours, cortical bone is no spot
+_AROUND_MM = 7.0  # edge of the box whose mean is the tissue around
+_WINDOW_MM = 2.5  # of the fit beyond the bead's radius
+_BLUR_MM = (0.15, 1.1)  # standard deviation of scanner and voxel together: half a voxel of 0.5 mm, a soft kernel
+_OBLONG = 1.7  # most by which a bead is longer than wide, of its blurred deviations
+_EXPLAINED = 0.80  # least share of the variance in the window that the fit explains
+_CANDIDATES = 100  # that are fitted, those that stand out most first
+_RIVAL = 0.5  # of the faintest bead: what comes as close to it makes the count doubtful
+_STEPS = 30  # of a fit
+_SPREAD_MM = 1.6  # by which blur widens a bead on each side, where it is half as bright as a clipped middle
+_CLIPPED = 3  # voxels at the largest value, from which on that is where the scanner clips
+
+
+def find_beads(ct: Volume, diameter_mm: float, count: int, within: Tensor | None, where: str = "CT") -> Tensor:
+    """Centres (count, 3) of metal beads in a CT in HU, mm in its space, ordered from head to foot.
+
+    Only voxels `within` (Z, Y, X), bool, are searched (None: all). Raises `InputError` that starts with `where` if
+    there are fewer beads, or more things that look like one.
+    """
+    if not 0.3 <= diameter_mm <= 6:
+        raise InputError(f"{where}: beads of {diameter_mm:g} mm were asked for, 0.3 to 6 mm were expected.")
+    spacing = np.array(ct.spacing_mm)
+    if spacing.max() > 2 * max(diameter_mm, 0.75):
+        raise InputError(
+            f"{where}: voxels of up to {spacing.max():.2g} mm are too coarse for beads of {diameter_mm:g} mm. Give the "
+            "points by hand."
+        )
+    data = ct.data.numpy()
+    low, high = _box(within, data.shape)
+    part = data[tuple(slice(a, b) for a, b in zip(low, high, strict=True))].astype(np.float32)
+    around = ndimage.uniform_filter(part, [max(3, round(_AROUND_MM / s) // 2 * 2 + 1) for s in spacing[::-1]])
+    stands_out = part - around
+    peaks = (stands_out > _ABOVE_HU) & (part == ndimage.maximum_filter(part, 3))
+    if within is not None:
+        peaks &= within.numpy()[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    index = np.argwhere(peaks)
+    index = index[np.argsort(-stands_out[peaks], kind="stable")][:_CANDIDATES] + low
+    largest = float(part.max())
+    clip = largest if (part >= largest).sum() >= _CLIPPED else np.inf
+    found: list[Array] = []  # (x, y, z index, mass)
+    contrasts = stands_out[tuple((index - low).T)]
+    faintest = np.inf
+    for (z, y, x), contrast in zip(index, contrasts, strict=True):
+        if len(found) >= count and contrast < _RIVAL * faintest:
+            break  # nothing that follows can be taken for a bead
+        spot = _fitted(data, np.array([x, y, z]), spacing, diameter_mm, clip)
+        if spot is not None and all(np.linalg.norm((spot[:3] - o[:3]) * spacing) > diameter_mm for o in found):
+            found.append(spot)
+            faintest = min(faintest, contrast)
+    found.sort(key=lambda spot: -spot[3])
+    if len(found) < count:
+        raise InputError(
+            f"{where}: {len(found)} beads of {diameter_mm:g} mm found, {count} were expected. Check their diameter and "
+            "the label map, or give the points by hand."
+        )
+    if len(found) > count and found[count][3] > _RIVAL * found[count - 1][3]:
+        alike = sum(spot[3] > _RIVAL * found[count - 1][3] for spot in found)
+        raise InputError(
+            f"{where}: {alike} spots look like beads of {diameter_mm:g} mm, {count} were expected. Check `count`, or "
+            "give the points by hand."
+        )
+    centres = transform_points(ct.lps_from_index, torch.from_numpy(np.array(found)[:count, :3]))
+    return centres[torch.argsort(-centres[:, 2])]
+
+
+def _box(within: Tensor | None, shape: tuple[int, ...]) -> tuple[list[int], list[int]]:
+    """First and last + 1 index [z, y, x] of what is to be searched."""
+    if within is None:
+        return [0, 0, 0], list(shape)
+    axes = [within.any(dim=(1, 2)), within.any(dim=(0, 2)), within.any(dim=(0, 1))]
+    spans = [axis.nonzero()[:, 0] for axis in axes]
+    if any(len(span) == 0 for span in spans):
+        raise InputError("beads: no voxel of the label map belongs to the object.")
+    return [int(span[0]) for span in spans], [int(span[-1]) + 1 for span in spans]
+
+
+def _fitted(data: NDArray[np.floating], start: Array, spacing: Array, diameter_mm: float, clip: float) -> Array | None:
+    """(x, y, z) index and mass (HU · mm³) of a round spot near a voxel (x, y, z); None if there is none."""
+    reach = diameter_mm / 2 + _WINDOW_MM
+    half = np.ceil(reach / spacing).astype(int)
+    low, high = start - half, start + half + 1
+    if (low < 0).any() or (high > np.array(data.shape[::-1])).any():
+        return None
+    part = data[low[2] : high[2], low[1] : high[1], low[0] : high[0]].astype(np.float64)
+    z, y, x = np.mgrid[-half[2] : half[2] + 1, -half[1] : half[1] + 1, -half[0] : half[0] + 1]
+    places = np.stack([x, y, z], -1) * spacing  # mm from the voxel
+    chosen = (np.linalg.norm(places, axis=-1) <= reach) & (part < clip)
+    if not _small(part, places, diameter_mm):
+        return None
+    places, values = places[chosen], part[chosen]
+    plane = np.column_stack([np.ones(len(values)), places])
+    if len(values) < 20:
+        return None
+
+    def solved(parameters: Array) -> tuple[Array, float]:
+        bead = np.exp(-(((places - parameters[:3]) / parameters[3:]) ** 2).sum(1) / 2)
+        terms = np.column_stack([bead, plane])
+        linear = np.linalg.lstsq(terms, values, rcond=None)[0]
+        return values - terms @ linear, float(linear[0])
+
+    ball = diameter_mm / 2 / np.sqrt(5)  # deviation of a full sphere along an axis
+    lowest, highest = (float(np.hypot(ball, blur)) for blur in _BLUR_MM)
+    first = np.array([0.0, 0, 0, *np.hypot(ball, np.maximum(0.5, spacing / 2))])
+    edge = float(spacing.max()) + diameter_mm / 2  # a clipped bead is a plateau, which may begin at its rim
+    bounds = ([-edge] * 3 + [lowest] * 3, [edge] * 3 + [highest] * 3)
+    fit = least_squares(
+        lambda p: solved(p)[0], first.clip(*bounds), bounds=bounds, x_scale=0.1, xtol=1e-5, max_nfev=_STEPS
+    )
+    residuals, height = solved(fit.x)
+    sizes = fit.x[3:]
+    explained = 1 - float((residuals**2).sum()) / max(float(((values - values.mean()) ** 2).sum()), 1e-9)
+    if (
+        height < _ABOVE_HU
+        or explained < _EXPLAINED
+        or sizes.max() > _OBLONG * sizes.min()
+        or sizes.max() > 0.98 * highest
+    ):
+        return None
+    mass = height * (2 * np.pi) ** 1.5 * float(np.prod(sizes))
+    return np.array([*(start + fit.x[:3] / spacing), mass])
+
+
+def _small(part: Array, places: Array, diameter_mm: float) -> bool:
+    """Whether what is more than half as bright as the middle takes no more room than a bead; `part` is its window."""
+    distance = np.linalg.norm(places, axis=-1)
+    level = float(np.median(part[distance > distance.max() - 1.0 - diameter_mm / 2]))
+    height = float(part[distance <= diameter_mm].max()) - level
+    voxel = float(np.prod([places[1, 1, 1, n] - places[0, 0, 0, n] for n in range(3)]))
+    room = np.pi / 6 * (diameter_mm + 2 * _SPREAD_MM) ** 3
+    inside = distance <= diameter_mm / 2 + _WINDOW_MM
+    return height > _ABOVE_HU and float((part[inside] > level + height / 2).sum()) * voxel <= room

@@ -1,0 +1,159 @@
+"""What a user says of beads: a YAML file that names them, and a table of their shadows."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from scipy import ndimage
+from torch import Tensor
+
+from femoreg_torch.beads.ct import find_beads
+from femoreg_torch.beads.model import Beads, check_beads
+from femoreg_torch.case import Case
+from femoreg_torch.case.fields import Fields
+from femoreg_torch.errors import InputError
+from femoreg_torch.registration.prepare import read_bones
+from femoreg_torch.volume import read_landmarks
+
+COLUMNS = ("image", "bead", "column_px", "row_px")
+IN_CT = "ct"
+_BY_HAND_MM, _MEASURED_MM = 0.2, 0.05  # deviations of bead centres along an axis: picked, and fitted in the CT
+_AROUND_MM = 4.0  # of the bone's labels, which is searched too: a label map may leave out a bead's voxels
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A shadow that somebody has picked."""
+
+    bead: str | None  # its name, where that is known
+    pixel: tuple[float, float]  # column, row
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """Beads, and what is known of their images."""
+
+    beads: tuple[Beads, ...]
+    marks: dict[str, tuple[Mark, ...]] | None  # by the name of an image; None: shadows are looked for
+    noise_px: float | None  # deviation of a shadow along each axis; None: estimated
+    first_view_only: bool
+
+
+def read_beads(path: Path, case: Case) -> Given:
+    """The beads of a case, by a YAML file; see `docs/beads.md`. Paths are relative to the file.
+
+    Raises `InputError` that names file and key.
+    """
+    path = Path(path)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file.") from error
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())}).") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: a mapping of keys and values was expected, found {type(content).__name__}.")
+    top = Fields(content, str(path)).only("objects", "annotations", "image_noise_px", "views")
+    entries = top.mapping("objects")
+    if not entries.content:
+        raise InputError(f"{top.where('objects')}: is empty. Name at least one object with beads.")
+    for name in entries.content:
+        if name not in case.objects:
+            raise InputError(f"{entries.where(str(name))}: the case has no such object, but {', '.join(case.objects)}.")
+    beads = tuple(_object(entries.mapping(name), name, case, path.parent) for name in entries.content)
+    names = [bead for thing in beads for bead in thing.names]
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"{top.where('objects')}: two beads are named {repeated[0]!r}. Give every bead its own name.")
+    marks = read_marks(top.file_path("annotations", path.parent), names, case) if "annotations" in top else None
+    noise = _positive(top, "image_noise_px") if "image_noise_px" in top else None
+    first = "views" in top and top.choice("views", ("all", "first")) == "first"
+    return Given(beads, marks, noise, first)
+
+
+def _object(fields: Fields, name: str, case: Case, folder: Path) -> Beads:
+    fields.only("points", "count", "diameter_mm", "noise_mm")
+    diameter = _positive(fields, "diameter_mm")
+    searched = fields.text("points", "a file of points, or `ct`") == IN_CT
+    if searched:
+        points = _in_ct(fields, name, case, diameter)
+        named = {f"{name}{number}": point for number, point in enumerate(points, 1)}
+    else:
+        if "count" in fields:
+            raise InputError(f"{fields.where('count')}: goes with `points: ct` only; a file tells by itself how many.")
+        named = read_landmarks(fields.file_path("points", folder), None)
+    points = torch.stack(list(named.values()))
+    check_beads(points, fields.where("points"))
+    noise = _positive(fields, "noise_mm", or_zero=True) if "noise_mm" in fields else None
+    deviation = (_MEASURED_MM if searched else _BY_HAND_MM) if noise is None else noise
+    return Beads(name, tuple(named), points, diameter, deviation)
+
+
+def _in_ct(fields: Fields, name: str, case: Case, diameter_mm: float) -> Tensor:
+    thing = case.objects[name]
+    if thing.model is not None:
+        raise InputError(
+            f"{fields.where('points')}: {name} is no bone of the CT. Give a file with points in its space."
+        )
+    count = fields.value("count", "the number of beads")
+    if not isinstance(count, int) or isinstance(count, bool) or count < 1:
+        raise InputError(f"{fields.where('count')}: a whole number of beads was expected, found {count!r}.")
+    ct, bones = read_bones(case)
+    mask = torch.isin(bones.labels.data, torch.tensor(bones.of(thing.bones, case.anatomy), dtype=torch.uint8))
+    voxels = [round(_AROUND_MM / s) for s in ct.spacing_mm[::-1]]
+    grown = ndimage.maximum_filter(mask.numpy(), [2 * n + 1 for n in voxels])
+    return find_beads(ct, diameter_mm, count, torch.from_numpy(grown), f"{case.ct_path}, beads of {name}")
+
+
+def _positive(fields: Fields, key: str, or_zero: bool = False) -> float:
+    value = fields.number(key)
+    if value < 0 or (value == 0 and not or_zero):
+        raise InputError(f"{fields.where(key)}: a positive number was expected, found {value:g}.")
+    return value
+
+
+def read_marks(path: Path, names: list[str], case: Case) -> dict[str, tuple[Mark, ...]]:
+    """Shadows that were picked, by the file name of their image, from a CSV file with the columns of `COLUMNS`.
+
+    `image` is the file name in the case, with or without its suffix; `bead` may be empty. Pixels count from the centre
+    of the first one. Raises `InputError` that names file and line.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
+    if not rows or not set(COLUMNS) <= set(rows[0]):
+        raise InputError(f"{path}: a header with {', '.join(COLUMNS)}, and rows below it, were expected.")
+    images = {image.name: image.name for view in case.views for image in view.images.values()}
+    images |= {Path(name).stem: name for name in images}
+    rows_px, columns_px = case.carm.camera.shape
+    found: dict[str, list[Mark]] = {}
+    for line, row in enumerate(rows, 2):
+        image = images.get((row["image"] or "").strip())
+        if image is None:
+            raise InputError(f"{path}, line {line}: the case has no image {row['image']!r}, but {', '.join(images)}.")
+        bead = (row["bead"] or "").strip() or None
+        if bead is not None and bead not in names:
+            raise InputError(f"{path}, line {line}: there is no bead {bead!r}, but {', '.join(names)}.")
+        column, height = (
+            _pixel(row[key], size, f"{path}, line {line}, {key}")
+            for key, size in (("column_px", columns_px), ("row_px", rows_px))
+        )
+        marks = found.setdefault(image, [])
+        if bead is not None and any(mark.bead == bead for mark in marks):
+            raise InputError(f"{path}, line {line}: bead {bead} stands there twice for {image}. Keep one.")
+        marks.append(Mark(bead, (column, height)))
+    return {image: tuple(marks) for image, marks in found.items()}
+
+
+def _pixel(value: Any, size: int, where: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = float("nan")
+    if not -0.5 <= number <= size - 0.5:
+        raise InputError(f"{where}: a pixel of the image from 0 to {size - 1} was expected, found {value!r}.")
+    return number
