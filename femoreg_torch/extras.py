@@ -8,7 +8,9 @@ _EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
     "lightning": "train",
     "tensorboard": "train",
     "joblib": "study",
-    "matplotlib": "all",  # in both `train` and `study`
+    "meshio": "plan",
+    "pyamg": "plan",
+    "matplotlib": "all",  # in `train`, `study` and `plan`
 }
 
 

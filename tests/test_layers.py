@@ -27,7 +27,7 @@ MAY_IMPORT = {
 ROOMS = (
     "errors", "exchange", "files", "extras", "configs", "settings", "extensions", "anatomy",
     "geometry", "volume", "drr", "fluoro", "case",
-    "detect", "pnp", "similarity", "optimize", "registration", "navigation", "evaluation", "commands",
+    "detect", "pnp", "similarity", "optimize", "registration", "navigation", "planning", "evaluation", "commands",
 )  # fmt: skip
 
 
