@@ -26,6 +26,11 @@ class Bone:
     material: Material  # MPa, 0 outside
     depth: Array  # mm beneath the surface
     marrow: NDArray[np.bool_]  # spongy bone that may take cement
+    pores: Array  # share of each voxel that is no solid bone, 0 outside the marrow: what cement can fill
+
+    def cement_ml(self, cement: NDArray) -> float:
+        """Volume of cement, from the share (X, Y, Z) of each voxel's pores that it fills."""
+        return float((self.pores * cement).sum()) * self.femur.voxel_ml
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +64,19 @@ def make_bone(femur: Femur, calibration: Calibration, planning: Planning) -> Bon
     if not count:
         raise InputError("CT: no spongy bone in the femur below distribution.cortex_g_cc. Check HU and calibration.")
     marrow = pieces == 1 + int(np.bincount(pieces.ravel())[1:].argmax())
-    return Bone(femur, calibration, ash, material, depth, marrow)
+    solid = ash / planning.bone.ash_of_apparent / planning.diffusion.solid_g_cc
+    pores = np.where(marrow, np.clip(1 - solid, 0.0, 1.0), 0.0)
+    return Bone(femur, calibration, ash, material, depth, marrow, pores)
+
+
+def check_volume(bone: Bone, volume_ml: float) -> None:
+    """Raises `InputError` for a volume of cement that is not above 0, or more than the marrow space takes."""
+    most = bone.cement_ml(np.ones(bone.pores.shape))
+    if not 0 < volume_ml < most:
+        raise InputError(
+            f"volume_ml: {volume_ml:g} ml of cement, but the marrow space of the {bone.femur.side} femur takes up to "
+            f"{most:.1f} ml. Choose less."
+        )
 
 
 def make_model(bone: Bone, planning: Planning, size_mm: float | None = None) -> Model:

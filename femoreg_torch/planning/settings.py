@@ -163,18 +163,16 @@ class DiffusionSettings:
     """How cement spreads in spongy bone."""
 
     voxel_mm: float
-    permeability_m2: float
     across: float
-    trabecular_g_cc: float
+    solid_g_cc: float
     rate_ml_min: float
 
     def __post_init__(self) -> None:
         _positive(
             "diffusion",
             voxel_mm=self.voxel_mm,
-            permeability_m2=self.permeability_m2,
             across=self.across,
-            trabecular_g_cc=self.trabecular_g_cc,
+            solid_g_cc=self.solid_g_cc,
             rate_ml_min=self.rate_ml_min,
         )
 
@@ -183,6 +181,7 @@ class DiffusionSettings:
 class OffsetSettings:
     """Offsets of a plan."""
 
+    moves: Literal["path", "pattern"]
     distance_mm: float
 
 
