@@ -10,6 +10,7 @@ _EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
     "joblib": "study",
     "meshio": "plan",
     "pyamg": "plan",
+    "pyarrow": "plan",
     "matplotlib": "all",  # in `train`, `study` and `plan`
 }
 

@@ -1,6 +1,5 @@
 """The load–displacement curve of a femur, and where on it the bone yields."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,9 +85,7 @@ class Press:
         forces = local @ elastic_stiffness(self._poisson)
         return np.asarray(0.5 * (forces * local).sum(1) * self.hardened(material).modulus * self.mesh.size_mm)
 
-    def curve(
-        self, material: Material, settings: CurveSettings, progress: Callable[[float], None] = lambda share: None
-    ) -> Curve:
+    def curve(self, material: Material, settings: CurveSettings) -> Curve:
         """The curve until the bone has yielded. Raises `InputError` where it does not converge or never yields.
 
         Each step is solved by Newton's method with the consistent tangent. The curve ends when the rule of the yield
@@ -120,7 +117,6 @@ class Press:
             newton += found.newton
             points.append(found)
             slope = (found.load_n - before.load_n) / (found.displacement_mm - before.displacement_mm) / stiffness
-            progress(min(1.0, (1 - slope) / (1 - settings.stop_stiffness)))
             if slope < settings.stop_stiffness and self._fulfilled(points, stiffness, settings):
                 break
             target = found.displacement_mm + step

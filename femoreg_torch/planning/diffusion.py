@@ -60,12 +60,9 @@ def diffuse(bone: Bone, injections: Sequence[Injection], settings: DiffusionSett
     for source, injection in zip(sources, injections, strict=True):
         _inject(full, room, links, source, injection.volume_ml)
     share = np.zeros(allowed.shape)
-    share[allowed] = full * pores[allowed]
-    filled = grid.spread(share)
-    offered = grid.spread(pores)
-    # blocks give what they hold to their voxels' pores, so that no cement is lost at the rim of the marrow
-    ratio = np.divide(filled, offered, where=offered > 0, out=np.zeros_like(filled))
-    return np.asarray(np.clip(ratio, 0, 1) * bone.marrow)
+    share[allowed] = full
+    # a voxel takes the mean of its blocks, so that blocks give away just what they hold
+    return np.asarray(grid.spread(share) * bone.marrow)
 
 
 def _source(centres: Array, injection: Injection, size_mm: float) -> int:

@@ -22,7 +22,7 @@ _STEP_MM = 0.5  # along a ray
 _LONGEST_MM = 160.0
 _NECK_MM = 45.0  # from the head's centre: so far the axis of the neck stays farthest from the surface
 _NECK_CONE_DEG = 25.0
-_GRID_MM = 2.0  # places whose worth is added up
+_GRID_MM = 3.0  # places whose worth is added up
 _POPULATION = 8  # of the search, times the number of parameters
 
 
@@ -185,17 +185,17 @@ class Planner:
         tilt = math.tan(math.radians(settings.angle_deg)) / math.sqrt(2)
         self.bounds = [(-reach, reach)] * 3 + [(-tilt, tilt)] * 2 + [(0.02, 0.85)] * count + [(low, high)] * 2 * count
 
-    def path(self, x: Array) -> tuple[Path, float] | None:
-        """The path of parameters and what it covers (1 is about the most there is); None if it leads nowhere."""
-        count, settings, frame = self.settings.ellipsoids, self.settings, self.around.frame
-        target = frame.head + x[0] * self.around.neck + x[1] * self._side + x[2] * self._front
+    def drilled(self, x: Array) -> Path | None:
+        """The path of parameters, without cement; None if it does not leave the bone."""
+        target = self.around.frame.head + x[0] * self.around.neck + x[1] * self._side + x[2] * self._front
         outward = self.around.neck + x[3] * self._side + x[4] * self._front
-        outward = outward / np.linalg.norm(outward)
-        entry = self.around.entry(target, outward)
-        if entry is None:
-            return None
-        length = float(np.linalg.norm(target - entry))
-        middles = target + (x[5 : 5 + count] * length)[:, None] * outward
+        entry = self.around.entry(target, outward / np.linalg.norm(outward))
+        return None if entry is None else Path(entry, target)
+
+    def filled(self, x: Array, path: Path) -> tuple[Path, float]:
+        """The path with the cement of the parameters, and what that covers; 1 is about the most there is."""
+        count, settings, length, outward = self.settings.ellipsoids, self.settings, path.length_mm, -path.direction
+        middles = path.target + (x[5 : 5 + count] * length)[:, None] * outward
         axes = np.exp(x[5 + count :]).reshape(count, 2)
         filled, nearest, scale = covered(outward, middles, axes, self._worth, self._volume)
         room = np.where(filled, self._worth.room_ml, 0.0)
@@ -214,19 +214,18 @@ class Planner:
         made.sort(key=lambda ellipsoid: -ellipsoid.depth_mm)
         whole = sum(e.volume_ml for e in made)
         kept = [Ellipsoid(e.depth_mm, e.along_mm, e.across_mm, e.volume_ml * self._volume / whole) for e in made]
-        return Path(entry, target, tuple(kept)), value
+        return Path(path.entry, path.target, tuple(kept)), value
 
     def cost(self, x: Array) -> float:
         """What the search makes small: less than 0 where all limits are kept."""
-        found = self.path(x)
-        if found is None:
+        path = self.drilled(x)
+        if path is None:
             return 1000.0
-        path, value = found
         excess = self.around.clearances(path, self.settings).excess(self.settings)
-        return -value if excess == 0 else 1.0 + excess
+        return 1.0 + excess if excess > 0 else -self.filled(x, path)[1]
 
     def search(self, rng: np.random.Generator, progress: Callable[[float], None] = lambda share: None) -> Array:
-        """The best parameters by differential evolution. Raises `InputError` if no path keeps all limits."""
+        """The best parameters (P,) by differential evolution. Raises `InputError` if no path keeps all limits."""
         size = _POPULATION * len(self.bounds)
         rounds = max(1, self.settings.evaluations // size - 1)
         done = 0
@@ -247,8 +246,8 @@ class Planner:
             callback=report,
         )
         if found.fun >= 1.0:
-            best = self.path(found.x)
-            told = "" if best is None else f" The nearest one: {self._told(best[0])}."
+            best = self.drilled(found.x)
+            told = "" if best is None else f" The nearest one: {self._told(best)}."
             raise InputError(f"path: none keeps all limits.{told} Relax them under `path`, or plan for another femur.")
         return np.asarray(found.x)
 
