@@ -96,27 +96,26 @@ def _inject(full: Array, room: Array, links: tuple[Ints, Ints, Array], source: i
     pressure = np.zeros(len(full))  # the last one, from which the next is found in few iterations
     while left > 1e-12:
         if full[source] < _FULL:
-            left = _pour(full, room, np.array([source]), np.array([1.0]), left, left)
+            left = _pour(full, room, np.array([source]), np.array([1.0]), left)
             continue
         front, flux = _front_flux(full, links, source, pressure)
-        if not len(front):
+        if not flux.any():
             raise InputError(
                 f"diffusion: {left:.2f} ml find no room, the marrow around the injection is full. Inject less, or "
                 "elsewhere."
             )
         times = np.sort((1 - full[front]) * room[front] / np.maximum(flux, 1e-30))  # until each is full
         step = min(left, times[min(len(front) - 1, int(_FRONT_SHARE * len(front)))])
-        left = left - step + _pour(full, room, front, flux, step, step)
+        left = left - step + _pour(full, room, front, flux, step)
 
 
-def _pour(full: Array, room: Array, blocks_: Ints, share: Array, volume_ml: float, most_ml: float) -> float:
+def _pour(full: Array, room: Array, blocks_: Ints, share: Array, volume_ml: float) -> float:
     """Spread a volume over blocks by their shares, what is too much over the others; returns what was not placed."""
-    left = min(volume_ml, most_ml)
+    left = volume_ml
     while left > 1e-13:
-        open_ = full[blocks_] < _FULL
-        if not open_.any():
+        part = np.where(full[blocks_] < _FULL, share, 0.0)
+        if part.sum() <= 0:  # what the flow reaches is full; where it goes next is another front
             return left
-        part = np.where(open_, share, 0.0)
         wanted = left * part / part.sum()
         taken = np.minimum(wanted, (1 - full[blocks_]) * room[blocks_])
         full[blocks_] += taken / room[blocks_]
@@ -153,7 +152,7 @@ def _front_flux(full: Array, links: tuple[Ints, Ints, Array], source: int, press
     pressure[wet] = found
     front, place = np.unique(outside, return_inverse=True)
     flux = np.bincount(place, to_front * np.maximum(found, 0)[number[inside]], len(front))
-    return front, flux / flux.sum()
+    return front, flux / max(float(flux.sum()), 1e-30)
 
 
 def _connected(wet: NDArray[np.bool_], first: Ints, second: Ints, source: int) -> NDArray[np.bool_]:

@@ -7,7 +7,7 @@ import pytest
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.calibration import Calibration
-from femoreg_torch.planning.diffusion import Injection, diffuse
+from femoreg_torch.planning.diffusion import Injection, _pour, diffuse
 from femoreg_torch.planning.femur import Femur
 from femoreg_torch.planning.laws import Material
 from femoreg_torch.planning.model import Bone
@@ -82,6 +82,24 @@ def test_coarser_blocks_give_nearly_the_same_cement(femur: Femur, planning: Plan
     fine, coarse = (diffuse(bone, [Injection(MIDDLE, 6.0)], settings(planning, voxel_mm=h)) for h in (1.0, 2.0))
     overlap = 2 * np.minimum(fine, coarse).sum() / (fine.sum() + coarse.sum())
     assert overlap > 0.93
+
+
+def test_cement_in_turns_in_a_narrow_canal_stays_finite_and_whole(femur: Femur, planning: Planning) -> None:
+    """The far end of a canal gets no flow that counts; what does not fit near the source waits for the next front."""
+    pores = np.zeros((COUNT,) * 3)
+    pores[18:23, 18:23, :] = 0.7
+    pores[10:31, 10:31, 30:] = 0.9
+    bone = spongy(femur, pores)
+    places = [np.array([20.0, 20.0, z]) for z in (36.0, 8.0, 20.0)]
+    cement = diffuse(bone, [Injection(p, v) for p, v in zip(places, (2.0, 0.2, 0.6), strict=True)], settings(planning))
+    assert np.isfinite(cement).all()
+    assert bone.cement_ml(cement) == pytest.approx(2.8, rel=1e-9)
+
+
+def test_what_the_flow_reaches_takes_no_more_than_its_room() -> None:
+    full, room = np.array([0.5, 0.0]), np.array([1.0, 1.0])
+    assert _pour(full, room, np.array([0, 1]), np.array([1.0, 0.0]), 0.8) == pytest.approx(0.3)
+    np.testing.assert_array_equal(full, [1.0, 0.0])
 
 
 def test_more_than_fits_and_places_outside_are_refused(femur: Femur, planning: Planning) -> None:
