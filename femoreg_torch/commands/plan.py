@@ -44,7 +44,10 @@ def plan(case: Path, *, out: Path, volume_ml: float = 9.5, preset: str = "defaul
         f"{found.curve.yield_load_n:.0f} N with {volume_ml:g} ml as planned ({100 * found.gain:+.1f} %), "
         f"{found.optimum.curve.yield_load_n:.0f} N at the free optimum ({100 * found.optimum_gain:+.1f} %)."
     )
-    console.print(f"Calibration: {calibration}" + (", loads in N are not to be trusted." * (calibration[0] == "u")))
+    doubt = (
+        "" if calibration == "phantom" else ", not by a phantom: trust no load in N, and compare within this CT only"
+    )
+    console.print(f"Calibration: {calibration}{doubt}.")
     console.print(f"Written to {out}")
 
 

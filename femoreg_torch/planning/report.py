@@ -49,7 +49,7 @@ def plan_content(case: Case, prepared: Prepared, plan: FemoroplastyPlan, seed: i
             for e, i in zip(path.ellipsoids, path.injections(), strict=True)
         ],
         "calibration": dataclasses.asdict(calibration),
-        "calibrated": calibration.kind != "uncalibrated",
+        "calibrated": calibration.kind == "phantom",
         "elements": len(prepared.model.mesh.elements),
         "baseline": curve_content(plan.optimum.baseline),
         "optimum": curve_content(plan.optimum.curve) | {"gain": plan.optimum_gain, "loads_n": plan.optimum.loads_n},
