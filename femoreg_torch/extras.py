@@ -1,4 +1,4 @@
-"""Packages that only simulation, training or studies import, and the extra of this distribution that installs them."""
+"""Packages that only simulation, training, studies or planning import, and the extra that installs them."""
 
 _EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
     "h5py": "sim",
@@ -11,8 +11,10 @@ _EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
     "distributed": "study",
     "joblib": "study",
     "pandas": "study",
-    "pyarrow": "study",
-    "matplotlib": "all",  # in both `train` and `study`
+    "pyamg": "plan",
+    "meshio": "plan",
+    "pyarrow": "all",  # in both `study` and `plan`
+    "matplotlib": "all",  # in `train`, `study` and `plan`
 }
 
 

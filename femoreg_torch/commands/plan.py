@@ -1,0 +1,129 @@
+"""`femoreg plan CASE` and what a plan is worth beside its place: `plan-offsets`, `plan-robustness`."""
+
+from pathlib import Path
+
+
+def plan(case: Path, *, out: Path, volume_ml: float = 9.5, preset: str = "default", seed: int = 0) -> None:
+    """Plan where cement is injected into a femur: entry point, direction, amounts, and the modelled gain.
+
+    Writes into OUT: plan.json (path in the form that a case's `plan:` takes, injections, loads, settings),
+    cement.nii.gz and optimum.nii.gz (label maps on the CT's grid), cement.stl and path.stl, path.mrk.json for 3D
+    Slicer, fields.vtu, curves.png and overlay.png. Loads are modelled, not measured; no medical device.
+
+    Args:
+        case: Folder with case.yaml, its CT, label map and landmarks.
+        out: Folder to write.
+        volume_ml: Cement in ml.
+        preset: Name in configs/planning, or a YAML file; it may say `extends: default`.
+        seed: Of the search for the path; same seed, same plan.
+    """
+    from rich.console import Console
+
+    from femoreg_torch.case import read_case
+    from femoreg_torch.commands.telling import progress_report
+    from femoreg_torch.files import new_folder
+    from femoreg_torch.planning.figures import curves_figure, overlay_figure, save
+    from femoreg_torch.planning.plan import make_plan
+    from femoreg_torch.planning.prepare import prepare
+    from femoreg_torch.planning.report import write_plan
+    from femoreg_torch.planning.settings import load_planning
+
+    console = Console()
+    content = read_case(case)
+    prepared = prepare(content, load_planning(preset))
+    with progress_report(console, "optimal cement") as report:
+        found = make_plan(prepared, volume_ml, seed, report)
+    with new_folder(out) as folder:
+        write_plan(folder, content, prepared, found, seed)
+        curves = {"without cement": found.optimum.baseline, "as planned": found.curve, "optimum": found.optimum.curve}
+        save(curves_figure(curves), folder / "curves.png")
+        save(overlay_figure(prepared, found), folder / "overlay.png")
+    calibration = prepared.bone.calibration.kind
+    console.print(
+        f"Modelled yield load {found.optimum.baseline.yield_load_n:.0f} N without cement, "
+        f"{found.curve.yield_load_n:.0f} N with {volume_ml:g} ml as planned ({100 * found.gain:+.1f} %), "
+        f"{found.optimum.curve.yield_load_n:.0f} N at the free optimum ({100 * found.optimum_gain:+.1f} %)."
+    )
+    doubt = (
+        "" if calibration == "phantom" else ", not by a phantom: trust no load in N, and compare within this CT only"
+    )
+    console.print(f"Calibration: {calibration}{doubt}.")
+    console.print(f"Written to {out}")
+
+
+def plan_offsets(plan: Path, *, distance_mm: float | None = None, case: Path | None = None) -> None:
+    """Move a plan by some mm in six directions and tell what is left of its gain.
+
+    Writes offsets.json and offsets.png into PLAN. Cement spreads anew from the moved path, or is moved itself, as
+    `offsets.moves` of the plan's settings says.
+
+    Args:
+        plan: Folder that `femoreg plan` wrote.
+        distance_mm: How far; as in the plan's settings if not given.
+        case: Folder of the case, if it is no longer where it was planned from.
+    """
+    from rich.console import Console
+
+    from femoreg_torch.commands.telling import progress_report
+    from femoreg_torch.files import write_json
+    from femoreg_torch.planning.figures import offsets_figure, save
+    from femoreg_torch.planning.offsets import directions
+    from femoreg_torch.planning.replan import Replan
+
+    console = Console()
+    again = Replan(plan, case)
+    far = again.stored.planning.offsets.distance_mm if distance_mm is None else distance_mm
+    wanted = {name: far * way for name, way in directions(again.side).items()}
+    with progress_report(console, "offsets") as report:
+        outcomes = {}
+        for n, (name, offset) in enumerate(wanted.items()):
+            report(name, n / len(wanted))
+            outcomes[name] = again.at(offset)
+    write_json(plan / "offsets.json", again.content({name: [o] for name, o in outcomes.items()}) | {"distance_mm": far})
+    save(offsets_figure(outcomes, again.baseline_n, again.planned_n), plan / "offsets.png")
+    console.print(f"As planned: {again.planned_n:.0f} N ({again.gain(again.planned_n):+.1f} %, modelled).")
+    for name, outcome in outcomes.items():
+        console.print(f"{far:g} mm {name}: {outcome.yield_load_n:.0f} N ({again.gain(outcome.yield_load_n):+.1f} %).")
+
+
+def plan_robustness(
+    plan: Path, *, study: Path, draws: int | None = None, seed: int = 0, case: Path | None = None
+) -> None:
+    """Carry a plan out under the errors of a study's registrations, and tell how its gain is distributed.
+
+    Writes robustness.json and robustness.png into PLAN. Errors are drawn from the trusted runs of the study.
+
+    Args:
+        plan: Folder that `femoreg plan` wrote.
+        study: Folder with runs.parquet or runs.csv, with signed errors of femur and device along each axis.
+        draws: How many; as in the plan's settings if not given.
+        seed: Of the draws.
+        case: Folder of the case, if it is no longer where it was planned from.
+    """
+    import numpy as np
+    from rich.console import Console
+
+    from femoreg_torch.commands.telling import progress_report
+    from femoreg_torch.files import write_json
+    from femoreg_torch.planning.figures import robustness_figure, save
+    from femoreg_torch.planning.offsets import study_offsets
+    from femoreg_torch.planning.replan import Replan
+
+    console = Console()
+    again = Replan(plan, case)
+    offsets = study_offsets(study, draws or again.stored.planning.robustness.draws, seed)
+    with progress_report(console, "draws") as report:
+        outcomes = []
+        for n, offset in enumerate(offsets):
+            report(f"draw {n + 1} of {len(offsets)}", n / len(offsets))
+            outcomes.append(again.at(offset))
+    gains = [again.gain(outcome.yield_load_n) for outcome in outcomes]
+    low, middle, high = np.percentile(gains, [5, 50, 95])
+    spread = {"gain_percent_p5": low, "gain_percent_median": middle, "gain_percent_p95": high, "seed": seed}
+    write_json(plan / "robustness.json", again.content({"draws": outcomes}) | spread)
+    save(robustness_figure(outcomes, again.baseline_n, again.planned_n), plan / "robustness.png")
+    least = min(outcome.clearance_mm for outcome in outcomes)
+    console.print(
+        f"Modelled gain {again.gain(again.planned_n):+.1f} % as planned; under the study's errors {middle:+.1f} % "
+        f"(5 to 95 %: {low:+.1f} to {high:+.1f} %). Least clearance {least:.1f} mm."
+    )

@@ -1,0 +1,103 @@
+"""Figures of a plan."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path as File
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from femoreg_torch.files import temporary_file
+from femoreg_torch.planning.curve import Curve
+from femoreg_torch.planning.offsets import Outcome
+from femoreg_torch.planning.plan import FemoroplastyPlan
+from femoreg_torch.planning.prepare import Prepared
+
+_PLANES = ("sagittal", "coronal", "axial")  # by the index axis square to them
+
+
+def save(figure: Figure, path: File) -> None:
+    """Write a figure as PNG, whole or not at all."""
+    with temporary_file(path) as part:
+        figure.savefig(part, dpi=110)
+
+
+def curves_figure(curves: Mapping[str, Curve]) -> Figure:
+    """Load over displacement, with the yield point of each curve."""
+    figure = Figure(figsize=(7, 5), layout="constrained")
+    axis = figure.subplots()
+    for name, curve in curves.items():
+        (line,) = axis.plot(curve.displacement_mm, curve.load_n, label=f"{name}: {curve.yield_load_n:.0f} N")
+        axis.plot(curve.yield_mm, curve.yield_load_n, "o", color=line.get_color())
+    axis.set(xlabel="displacement of the pad, mm", ylabel="load on the head, N", title="Modelled load; dot: yield load")
+    axis.legend(loc="lower right")
+    axis.grid(alpha=0.3)
+    return figure
+
+
+def overlay_figure(prepared: Prepared, plan: FemoroplastyPlan) -> Figure:
+    """Three planes through the middle of the cement: CT, cement (filled), optimum (outline) and path (projected)."""
+    femur = prepared.bone.femur
+    weight = plan.cement * prepared.bone.pores
+    middle = np.round((np.argwhere(weight > 0) * weight[weight > 0][:, None]).sum(0) / weight.sum()).astype(int)
+    ends = femur.index(np.stack([plan.path.entry, plan.path.target]))
+    figure = Figure(figsize=(14, 5.5), layout="constrained")
+    names = ("R ← mm → L", "A ← mm → P", "mm → head")
+    for normal, (axis, plane) in enumerate(zip(figure.subplots(1, 3), _PLANES, strict=True)):
+        across = [n for n in range(3) if n != normal]
+        cut = tuple(middle[normal] if n == normal else slice(None) for n in range(3))
+        size = [femur.mask.shape[n] * femur.spacing[n] for n in across]
+        extent = (0.0, float(size[0]), 0.0, float(size[1]))
+        axis.imshow(femur.hu[cut].T, cmap="gray", vmin=-200, vmax=1300, origin="lower", extent=extent)
+        filled = np.ma.masked_less(plan.cement[cut].T, 0.05)
+        axis.imshow(filled, cmap="autumn", vmin=0, vmax=1, alpha=0.6, origin="lower", extent=extent)
+        grid = [(np.arange(femur.mask.shape[n]) + 0.5) * femur.spacing[n] for n in across]
+        axis.contour(*grid, plan.optimum.cement[cut].T, levels=[0.5], colors="deepskyblue", linewidths=1.2)
+        line = (ends[:, across] + 0.5) * femur.spacing[across]
+        axis.plot(*line.T, "-", color="lime", linewidth=2)
+        axis.plot(*line[0], "o", color="lime")
+        axis.set(title=plane, xlabel=names[across[0]], ylabel=names[across[1]])
+    figure.suptitle(
+        f"cement as planned (filled), free optimum (blue), path (green; dot: entry point) — {plan.volume_ml:g} ml, "
+        f"yield load {100 * plan.gain:+.0f} % (optimum {100 * plan.optimum_gain:+.0f} %), modelled"
+    )
+    return figure
+
+
+def offsets_figure(outcomes: Mapping[str, Outcome], baseline_n: float, planned_n: float) -> Figure:
+    """Gain in each direction beside that of the plan."""
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axis = figure.subplots()
+    gains = [100 * (outcome.yield_load_n / baseline_n - 1) for outcome in outcomes.values()]
+    axis.bar(list(outcomes), gains, color="#3b6ea5")
+    axis.axhline(100 * (planned_n / baseline_n - 1), color="#c0602b", label="as planned")
+    axis.set(ylabel="gain of yield load, %", title="Plan carried out beside its place, modelled")
+    axis.legend(loc="lower right")
+    return figure
+
+
+def robustness_figure(outcomes: Sequence[Outcome], baseline_n: float, planned_n: float) -> Figure:
+    """Distributions of gain and clearance under errors of registration."""
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    distance = [float(np.linalg.norm(outcome.offset_mm)) for outcome in outcomes]
+    gains = [100 * (outcome.yield_load_n / baseline_n - 1) for outcome in outcomes]
+    left.plot(distance, gains, "o", color="#3b6ea5")
+    left.axhline(100 * (planned_n / baseline_n - 1), color="#c0602b", label="as planned")
+    left.set(xlabel="error of the path, mm", ylabel="gain of yield load, %", title="Gain, modelled")
+    left.legend(loc="lower left")
+    right.hist([outcome.clearance_mm for outcome in outcomes], bins=15, color="#3b6ea5")
+    right.set(xlabel="clearance of the path to the surface, mm", ylabel="draws", title="Clearance")
+    return figure
+
+
+def mesh_figure(rows: Sequence[tuple[float, float, float]]) -> Figure:
+    """Yield load without cement, and gain, over the size of the elements: rows of size mm, load N, gain."""
+    figure = Figure(figsize=(10, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    size, load, gain = np.array(rows).T
+    left.plot(size, load, "o-", color="#3b6ea5")
+    left.set(xlabel="elements, mm", ylabel="yield load without cement, N", ylim=(0, 1.15 * load.max()))
+    right.plot(size, 100 * gain, "o-", color="#c0602b")
+    right.set(xlabel="elements, mm", ylabel="gain of the same cement, %", ylim=(0, 115 * gain.max()))
+    figure.suptitle("The same femur and cement on finer meshes, modelled")
+    return figure

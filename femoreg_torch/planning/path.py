@@ -1,0 +1,270 @@
+"""One drill path with ellipsoids of cement along it, that covers what is worth most under constraints."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.optimize import differential_evolution
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.planning.diffusion import Injection
+from femoreg_torch.planning.femur import Frame
+from femoreg_torch.planning.mesh import blocks
+from femoreg_torch.planning.model import Bone
+from femoreg_torch.planning.settings import PathSettings
+
+Array = NDArray[np.float64]
+
+_STEP_MM = 0.5  # along a ray
+_LONGEST_MM = 160.0
+_NECK_MM = 45.0  # from the head's centre: so far the axis of the neck stays farthest from the surface
+_NECK_CONE_DEG = 25.0
+_GRID_MM = 3.0  # places whose worth is added up
+_POPULATION = 8  # of the search, times the number of parameters
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoid:
+    """Cement around the path: turned about it, its middle at a depth from the entry point."""
+
+    depth_mm: float
+    along_mm: float  # semi-axes
+    across_mm: float
+    volume_ml: float  # of cement, its part of the whole
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A straight path, LPS mm, and the cement along it, from deep to shallow."""
+
+    entry: Array  # (3,)
+    target: Array  # (3,) where the drill stops
+    ellipsoids: tuple[Ellipsoid, ...] = ()
+
+    @property
+    def length_mm(self) -> float:
+        """From entry point to target."""
+        return float(np.linalg.norm(self.target - self.entry))
+
+    @property
+    def direction(self) -> Array:
+        """Unit vector (3,) from the entry point to the target."""
+        return np.asarray((self.target - self.entry) / self.length_mm)
+
+    def injections(self) -> list[Injection]:
+        """What is injected, in order."""
+        return [Injection(self.entry + e.depth_mm * self.direction, e.volume_ml) for e in self.ellipsoids]
+
+
+@dataclass(frozen=True)
+class Clearances:
+    """What a path keeps away from, and what its limits are."""
+
+    cortex_mm: float  # of the path to the surface, but near the entry
+    head_mm: float  # of its end to the surface
+    entry_angle_deg: float  # to the normal of the surface
+    entry_below_mm: float  # below the head's centre
+    target_from_head_mm: float
+    neck_angle_deg: float
+
+    def excess(self, settings: PathSettings) -> float:
+        """By how much limits are broken, in their own units, summed up; 0 where all are kept."""
+        broken = (
+            settings.clearance_mm - self.cortex_mm,
+            settings.tip_clearance_mm - self.head_mm,
+            self.entry_angle_deg - settings.entry_angle_deg,
+            self.entry_below_mm - settings.lowest_entry_mm,
+            self.target_from_head_mm - settings.target_mm,
+            self.neck_angle_deg - settings.angle_deg,
+        )
+        return float(sum(max(0.0, value - 1e-9) for value in broken))
+
+
+class Surroundings:
+    """A bone as a path sees it: depth beneath the surface, the axis of its neck."""
+
+    def __init__(self, bone: Bone) -> None:
+        self.frame: Frame = bone.femur.frame
+        self._femur = bone.femur
+        self._depth = bone.femur.depth()
+        smooth = ndimage.gaussian_filter(self._depth, 2.0 / bone.femur.spacing)
+        self._slopes = np.stack(np.gradient(smooth, *bone.femur.spacing))
+        self.neck = self._neck_axis()
+
+    def depth(self, points: Array) -> Array:
+        """mm beneath the surface (…) of points (…, 3); outside the CT's box −10."""
+        index = np.moveaxis(self._femur.index(points), -1, 0)
+        return np.asarray(ndimage.map_coordinates(self._depth, index, order=1, mode="constant", cval=-10.0))
+
+    def entry(self, target: Array, outward: Array) -> Array | None:
+        """Where a ray (3,) from the target first leaves the bone, or None if it does not within its length."""
+        along = np.arange(0.0, _LONGEST_MM, _STEP_MM)
+        depth = self.depth(target + along[:, None] * outward)
+        if depth[0] <= 0 or not (depth <= 0).any():
+            return None
+        n = int(np.argmax(depth <= 0))
+        share = depth[n - 1] / (depth[n - 1] - depth[n])
+        return np.asarray(target + (along[n - 1] + share * _STEP_MM) * outward)
+
+    def clearances(self, path: Path, settings: PathSettings) -> Clearances:
+        """What the path keeps away from."""
+        depths = np.arange(settings.entry_free_mm, path.length_mm, 1.0)
+        inside = path.entry + depths[:, None] * path.direction
+        index = self._femur.index(path.entry)[:, None]
+        slope = np.array([ndimage.map_coordinates(part, index, order=1, mode="nearest")[0] for part in self._slopes])
+        inward = self._femur.axes @ slope
+        cosine = float(inward @ path.direction / max(float(np.linalg.norm(inward)), 1e-9))
+        return Clearances(
+            cortex_mm=float(self.depth(inside).min()) if len(inside) else -10.0,
+            head_mm=float(self.depth(path.target[None])[0]),
+            entry_angle_deg=math.degrees(math.acos(np.clip(cosine, -1, 1))),
+            entry_below_mm=float((self.frame.head - path.entry) @ self.frame.proximal),
+            target_from_head_mm=float(np.linalg.norm(path.target - self.frame.head)),
+            neck_angle_deg=math.degrees(math.acos(np.clip(-path.direction @ self.neck, -1, 1))),
+        )
+
+    def _neck_axis(self) -> Array:
+        """The direction from the head's centre in which the surface stays farthest, near 45° to the shaft."""
+        first = self.frame.neck
+        second = np.cross(first, self.frame.posterior)
+        angles = np.radians(np.arange(-_NECK_CONE_DEG, _NECK_CONE_DEG + 1, 2.5))
+        tilted = [first + math.tan(a) * second + math.tan(b) * self.frame.posterior for a in angles for b in angles]
+        directions = np.array([v / np.linalg.norm(v) for v in tilted])
+        along = np.arange(15.0, _NECK_MM, 1.0)
+        depth = self.depth(self.frame.head + along[None, :, None] * directions[:, None])
+        return np.asarray(directions[int(depth.min(1).argmax())])
+
+
+@dataclass(frozen=True, eq=False)
+class Worth:
+    """Places in the marrow: where (N, 3), LPS mm, how much cement each takes (ml), what it is worth per ml."""
+
+    points: Array
+    room_ml: Array
+    worth: Array
+
+
+def covered(
+    path_direction: Array, middles: Array, axes: Array, worth: Worth, volume_ml: float
+) -> tuple[Array, Array, float]:
+    """Which places (N,) a volume of cement in ellipsoids fills, which ellipsoid each is of, and the axes' scale.
+
+    `middles` (K, 3) and `axes` (K, 2), along and across, are scaled together until just the volume is in the marrow.
+    """
+    offset = worth.points[:, None] - middles
+    along = offset @ path_direction
+    across = np.maximum((offset**2).sum(-1) - along**2, 0)
+    level = np.sqrt((along / axes[:, 0]) ** 2 + across / axes[:, 1] ** 2)
+    nearest = level.argmin(1)
+    least = level.min(1)
+    order = np.argsort(least, kind="stable")
+    sums = np.cumsum(worth.room_ml[order])
+    last = min(int(np.searchsorted(sums, volume_ml)), len(order) - 1)
+    filled = np.zeros(len(order), bool)
+    filled[order[: last + 1]] = True
+    return filled, nearest, float(least[order[last]])
+
+
+class Planner:
+    """The search for a path: its parameters, what they mean, and what they are worth."""
+
+    def __init__(self, around: Surroundings, worth: Worth, volume_ml: float, settings: PathSettings) -> None:
+        self.around, self.settings = around, settings
+        self._worth, self._volume = worth, volume_ml
+        self._best = float(np.sort(worth.worth)[::-1][: max(1, len(worth.worth) // 10)].mean()) * volume_ml
+        neck = around.neck
+        side = np.cross(neck, around.frame.posterior)
+        self._side = side / np.linalg.norm(side)
+        self._front = np.cross(self._side, neck)
+        low, high = math.log(settings.least_axis_mm), math.log(settings.most_axis_mm)
+        count = settings.ellipsoids
+        reach = settings.target_mm / math.sqrt(3)
+        tilt = math.tan(math.radians(settings.angle_deg)) / math.sqrt(2)
+        self.bounds = [(-reach, reach)] * 3 + [(-tilt, tilt)] * 2 + [(0.02, 0.85)] * count + [(low, high)] * 2 * count
+
+    def drilled(self, x: Array) -> Path | None:
+        """The path of parameters, without cement; None if it does not leave the bone."""
+        target = self.around.frame.head + x[0] * self.around.neck + x[1] * self._side + x[2] * self._front
+        outward = self.around.neck + x[3] * self._side + x[4] * self._front
+        entry = self.around.entry(target, outward / np.linalg.norm(outward))
+        return None if entry is None else Path(entry, target)
+
+    def filled(self, x: Array, path: Path) -> tuple[Path, float]:
+        """The path with the cement of the parameters, and what that covers; 1 is about the most there is."""
+        count, settings, length, outward = self.settings.ellipsoids, self.settings, path.length_mm, -path.direction
+        middles = path.target + (x[5 : 5 + count] * length)[:, None] * outward
+        axes = np.exp(x[5 + count :]).reshape(count, 2)
+        filled, nearest, scale = covered(outward, middles, axes, self._worth, self._volume)
+        room = np.where(filled, self._worth.room_ml, 0.0)
+        parts = np.bincount(nearest, room, count)
+        parts *= self._volume / parts.sum()
+        scaled = axes * scale
+        outside = (
+            np.maximum(scaled - settings.most_axis_mm, 0).sum() + np.maximum(settings.least_axis_mm - scaled, 0).sum()
+        )
+        value = float((room * self._worth.worth).sum()) / self._best - 0.1 * float(outside)
+        made = [
+            Ellipsoid(length * (1 - share), float(axis[0]), float(axis[1]), float(part))
+            for share, axis, part in zip(x[5 : 5 + count], scaled, parts, strict=True)
+            if part > 0.01 * self._volume
+        ]
+        made.sort(key=lambda ellipsoid: -ellipsoid.depth_mm)
+        whole = sum(e.volume_ml for e in made)
+        kept = [Ellipsoid(e.depth_mm, e.along_mm, e.across_mm, e.volume_ml * self._volume / whole) for e in made]
+        return Path(path.entry, path.target, tuple(kept)), value
+
+    def cost(self, x: Array) -> float:
+        """What the search makes small: less than 0 where all limits are kept."""
+        path = self.drilled(x)
+        if path is None:
+            return 1000.0
+        excess = self.around.clearances(path, self.settings).excess(self.settings)
+        return 1.0 + excess if excess > 0 else -self.filled(x, path)[1]
+
+    def search(self, rng: np.random.Generator, progress: Callable[[float], None] = lambda share: None) -> Array:
+        """The best parameters (P,) by differential evolution. Raises `InputError` if no path keeps all limits."""
+        size = _POPULATION * len(self.bounds)
+        rounds = max(1, self.settings.evaluations // size - 1)
+        done = 0
+
+        def report(intermediate_result: object) -> None:
+            nonlocal done
+            done += 1
+            progress(min(1.0, done / rounds))
+
+        found = differential_evolution(
+            self.cost,
+            self.bounds,
+            maxiter=rounds,
+            popsize=_POPULATION,
+            rng=rng,
+            tol=1e-4,
+            polish=False,
+            callback=report,
+        )
+        if found.fun >= 1.0:
+            best = self.drilled(found.x)
+            told = "" if best is None else f" The nearest one: {self._told(best)}."
+            raise InputError(f"path: none keeps all limits.{told} Relax them under `path`, or plan for another femur.")
+        return np.asarray(found.x)
+
+    def _told(self, path: Path) -> str:
+        found = self.around.clearances(path, self.settings)
+        return (
+            f"{found.cortex_mm:.1f} mm to the cortex, {found.head_mm:.1f} mm to the surface of the head, entry "
+            f"{found.entry_angle_deg:.0f}° off the normal and {found.entry_below_mm:.0f} mm below the head"
+        )
+
+
+def places(bone: Bone, worth: Array, size_mm: float = _GRID_MM) -> Worth:
+    """Marrow in places of some mm, with what cement there is worth, from a map (X, Y, Z) of the voxels."""
+    grid = blocks(bone.femur, size_mm)
+    room = grid.mean(bone.pores)
+    index = np.argwhere(room > 0.05)
+    where = tuple(index.T)
+    pores = room[where]
+    value = grid.mean(bone.pores * worth)[where] / pores
+    return Worth(grid.centres(index), pores * size_mm**3 / 1000, value)

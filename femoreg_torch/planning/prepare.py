@@ -1,0 +1,69 @@
+"""From a case on disk to a femur under its pads."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from femoreg_torch.case import Case
+from femoreg_torch.errors import InputError
+from femoreg_torch.planning.calibration import calibrate
+from femoreg_torch.planning.curve import Curve, Press
+from femoreg_torch.planning.femur import cut_out
+from femoreg_torch.planning.loading import make_loading
+from femoreg_torch.planning.model import Bone, Model, make_bone, make_model, with_cement
+from femoreg_torch.planning.settings import Planning
+from femoreg_torch.registration.prepare import read_bones
+from femoreg_torch.volume import Volume
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A femur, its finite-element model and its loading; `ct` is the whole CT, for files on its grid."""
+
+    ct: Volume
+    bone: Bone
+    model: Model
+    press: Press
+    planning: Planning
+
+    def curve(self, cement: Array | None = None) -> Curve:
+        """The curve of the femur with cement as shares (X, Y, Z) of the voxels' pores, or without."""
+        material = self.model.material
+        if cement is not None and cement.any():
+            material = with_cement(self.model, self.bone, cement, self.planning.cement)
+        return self.press.curve(material, self.planning.curve)
+
+    def on_ct(self, cement: Array) -> Volume:
+        """The label map (0 or 1) of voxels with half of their pores or more in cement, on the grid of the whole CT."""
+        data = np.zeros(self.ct.data.shape[::-1], np.uint8)
+        box = tuple(
+            slice(start, start + size) for start, size in zip(self.bone.femur.corner, cement.shape, strict=True)
+        )
+        data[box] = cement >= 0.5
+        import torch
+
+        return self.ct.with_data(torch.from_numpy(np.ascontiguousarray(data.transpose(2, 1, 0))))
+
+
+def prepare(case: Case, planning: Planning, size_mm: float | None = None) -> Prepared:
+    """Read CT and labels of a case and build the model of the femur of its side.
+
+    Raises `InputError` for a case without side or head centre, and for what its CT and label map do not allow.
+    """
+    if case.side is None:
+        raise InputError(f"{case.folder}/case.yaml, side: missing. Which femur is planned for, left or right?")
+    name = f"FH-{case.side[0]}"
+    if name not in case.landmarks:
+        raise InputError(f"{case.folder}: landmark {name}, the centre of the {case.side} femoral head, is missing.")
+    ct, bones = read_bones(case)
+    (number,) = bones.of([f"femur_{case.side}"], case.anatomy)
+    head = case.landmarks[name].numpy()
+    femur = cut_out(ct, bones.labels, number, head, case.side, planning.mesh.shaft_mm)
+    bone = make_bone(femur, calibrate(ct.data.numpy(), planning.calibration), planning)
+    model = make_model(bone, planning, size_mm)
+    loading = make_loading(model.mesh, femur.frame, planning.load)
+    press = Press(model.mesh, loading, planning.bone.poisson, planning.load.pad_modulus_mpa)
+    return Prepared(ct, bone, model, press, planning)

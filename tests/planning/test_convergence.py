@@ -1,0 +1,61 @@
+"""Loads and gain on finer meshes: with 3 mm close to what finer ones say."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from femoreg_torch.planning.calibration import Calibration
+from femoreg_torch.planning.convergence import on_meshes
+from femoreg_torch.planning.curve import Press
+from femoreg_torch.planning.femur import Femur
+from femoreg_torch.planning.figures import mesh_figure
+from femoreg_torch.planning.loading import make_loading
+from femoreg_torch.planning.model import make_bone, make_model
+from femoreg_torch.planning.plan import until_yield
+from femoreg_torch.planning.prepare import Prepared
+from femoreg_torch.planning.settings import Planning
+from femoreg_torch.volume import Volume
+
+
+def prepared_femur(ct: Volume, femur: Femur, planning: Planning, size_mm: float) -> Prepared:
+    bone = make_bone(femur, Calibration("uncalibrated", 0.000887, 0.0633, {}), planning)
+    model = make_model(bone, planning, size_mm)
+    loading = make_loading(model.mesh, femur.frame, planning.load)
+    press = Press(model.mesh, loading, planning.bone.poisson, planning.load.pad_modulus_mpa)
+    return until_yield(Prepared(ct, bone, model, press, planning))
+
+
+def in_the_neck(prepared: Prepared) -> np.ndarray:
+    """Cement in the marrow within 13 mm of the middle of the neck."""
+    femur = prepared.bone.femur
+    points = femur.points(np.argwhere(np.ones(femur.mask.shape, bool))).reshape(*femur.mask.shape, 3)
+    near = np.linalg.norm(points - (femur.frame.head + 26 * femur.frame.neck), axis=-1) < 13
+    return (near & prepared.bone.marrow).astype(float)
+
+
+def test_the_first_row_is_the_model_itself(
+    solids: tuple[Volume, Volume, np.ndarray], femur: Femur, planning: Planning
+) -> None:
+    quick = dataclasses.replace(planning, curve=dataclasses.replace(planning.curve, step_mm=0.5))
+    prepared = prepared_femur(solids[0], femur, quick, 8.0)
+    cement = in_the_neck(prepared)
+    ((size, load, gain),) = on_meshes(prepared, cement, [8.0])
+    assert size == 8.0
+    assert load == prepared.curve().yield_load_n
+    assert gain == pytest.approx(prepared.curve(cement).yield_load_n / load - 1)
+    assert gain > 0
+    figure = mesh_figure([(size, load, gain), (6.0, load, gain)])
+    assert [axis.get_xlabel() for axis in figure.axes] == ["elements, mm"] * 2
+
+
+@pytest.mark.long
+def test_three_millimetres_agree_with_finer_meshes(
+    solids: tuple[Volume, Volume, np.ndarray], femur: Femur, planning: Planning
+) -> None:
+    prepared = prepared_femur(solids[0], femur, planning, 3.0)
+    rows = on_meshes(prepared, in_the_neck(prepared), [3.0, 2.0, 1.5])
+    _, finest_load, finest_gain = rows[-1]
+    for _, load, gain in rows:
+        assert load == pytest.approx(finest_load, rel=0.05)
+        assert gain == pytest.approx(finest_gain, abs=0.03)

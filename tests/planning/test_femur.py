@@ -1,0 +1,162 @@
+"""Calibration, laws, the femur's frame and its model, against numbers that are known otherwise; and bad input."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.planning.calibration import Calibration, calibrate
+from femoreg_torch.planning.femur import Femur, cut_out
+from femoreg_torch.planning.laws import bone_material
+from femoreg_torch.planning.mesh import blocks
+from femoreg_torch.planning.model import make_bone, make_model, with_cement
+from femoreg_torch.planning.settings import CalibrationSettings, Planning, load_planning
+from femoreg_torch.volume import Volume
+
+Solids = tuple[Volume, Volume, np.ndarray]
+RIGHT_KIND = {"rods": [], "mineral": "ha", "air_fat_muscle_mg_cc": (-840.0, -80.0, 30.0)}
+
+
+def test_rods_on_a_line_give_that_line() -> None:
+    rods = [(float(hu), 0.8 * hu - 12) for hu in (-50, 10, 200, 400)]
+    found = calibrate(np.zeros((2, 2, 2), np.float32), CalibrationSettings("phantom", rods, "k2hpo4", (0.0, 0.0, 0.0)))
+    np.testing.assert_allclose([found.slope, found.intercept], [1.06 * 0.0008, (1.06 * -12 + 38.9) / 1000])
+
+
+def test_air_fat_and_muscle_are_found_by_their_peaks(solids: Solids) -> None:
+    noisy = solids[0].data.numpy() + np.random.default_rng(0).normal(0, 8, solids[0].data.shape)
+    found = calibrate(noisy.astype(np.float32), CalibrationSettings("internal", **RIGHT_KIND))
+    hu = np.array([value for value, _ in found.references.values()])
+    np.testing.assert_allclose(hu, [-1000, -95, 50], atol=3)
+    slope, intercept = np.polyfit(hu, [-840, -80, 30], 1)
+    np.testing.assert_allclose([found.slope, found.intercept], [0.000887 * slope, (0.887 * intercept + 63.3) / 1000])
+
+
+def test_laws_at_densities_worked_out_by_hand(planning: Planning) -> None:
+    keyak = bone_material(np.array([0.5]), planning.bone)
+    np.testing.assert_allclose(keyak.modulus, 14900 * 0.27547628)  # 0.5 ** 1.86
+    np.testing.assert_allclose(keyak.tension, 102 * 0.28717459)  # 0.5 ** 1.8
+    morgan = bone_material(np.array([0.3]), dataclasses.replace(planning.bone, law="morgan"))
+    np.testing.assert_allclose(morgan.modulus, 6850 * 0.35601255, rtol=1e-6)  # (0.3 / 0.6) ** 1.49
+    np.testing.assert_allclose(morgan.compression / morgan.tension, 85 / 61)
+
+
+def test_the_frame_is_that_of_the_solids(femur: Femur) -> None:
+    frame = femur.frame
+    np.testing.assert_allclose(frame.proximal, [0, 0, 1], atol=0.01)
+    np.testing.assert_allclose(frame.lateral, [1, 0, 0], atol=0.02)
+    np.testing.assert_allclose(frame.posterior, [0, 1, 0], atol=0.02)
+    np.testing.assert_allclose(frame.shaft, [65, 0, 130], atol=0.5)
+    assert frame.head_radius == pytest.approx(22, abs=1.5)
+
+
+def test_blocks_average_every_voxel_alike(femur: Femur) -> None:
+    whole = tuple(n // 3 * 3 for n in femur.mask.shape)
+    cut = dataclasses.replace(femur, mask=femur.mask[: whole[0], : whole[1], : whole[2]])
+    values = np.random.default_rng(1).random(whole)
+    grid = blocks(cut, 6.0)
+    expected = values.reshape(whole[0] // 3, 3, whole[1] // 3, 3, whole[2] // 3, 3).mean((1, 3, 5))
+    np.testing.assert_allclose(grid.mean(values), expected)
+    np.testing.assert_allclose(grid.mean(grid.spread(expected)), expected)
+    odd = blocks(femur, 5.0)
+    np.testing.assert_allclose(odd.mean(np.flip(femur.mask, 0)), np.flip(odd.mean(femur.mask), 0))
+
+
+def test_the_mesh_has_the_volume_of_the_label_and_the_surface_its_projection(femur: Femur, planning: Planning) -> None:
+    bone = make_bone(femur, Calibration("uncalibrated", 0.000887, 0.0633, {}), planning)
+    model = make_model(bone, planning, 4.0)
+    kept = femur.mask.copy()
+    z = np.arange(kept.shape[2]) * 2 + femur.lps_from_index[2, 3]
+    kept[:, :, z < 130 - 95] = False
+    assert model.fill.sum() * 4**3 == pytest.approx(kept.sum() * 2**3, rel=0.02)
+    for direction in np.eye(3):
+        width = model.mesh.surface(direction).sum()
+        assert width == pytest.approx(model.mesh.surface(-direction).sum())
+        assert width >= kept.any(int(direction.argmax())).sum() * 4 * 0.99
+
+
+def test_cement_replaces_bone_voxel_by_voxel(femur: Femur, planning: Planning) -> None:
+    bone = make_bone(femur, Calibration("uncalibrated", 0.000887, 0.0633, {}), planning)
+    model = make_model(bone, planning, 4.0)
+    none = with_cement(model, bone, np.zeros(femur.mask.shape), planning.cement)
+    np.testing.assert_allclose(none.modulus, model.material.modulus)
+    full = with_cement(model, bone, np.ones(femur.mask.shape), planning.cement)
+    deep = model.fill == 1
+    np.testing.assert_allclose(full.modulus[deep], planning.cement.modulus_mpa)
+    np.testing.assert_allclose(full.tension[deep], planning.cement.strength_mpa)
+
+
+def changed(labels: Volume, change: str) -> Volume:
+    data = labels.data.clone()
+    if change == "pieces":
+        data[2:20, 2:8, 2:8] = 1
+    elif change == "hollow":
+        data[40:60, 17:23, 39:45] = 0
+    elif change == "top":
+        data = torch.cat([data[20:], data[:20]])[:56]
+    elif change == "side":
+        data = data.roll(12, dims=2)
+        data[:, :, :6] = 0
+    elif change == "short":
+        data[:32] = 0
+    elif change == "empty":
+        data[:] = 0
+    return Volume(data, labels.lps_from_index)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("pieces", "has 2 pieces, the second holds 648 voxels"),
+        ("hollow", r"has holes of \d+ voxels"),
+        ("top", "cut off by the CT at the top"),
+        ("side", "cut off by the CT on the left"),
+        ("short", "shows the left femur to 66 mm below"),
+        ("empty", "no voxel of the left femur"),
+    ],
+)
+def test_a_bad_label_is_told_in_one_line(solids: Solids, change: str, message: str) -> None:
+    ct, labels, head = solids
+    bad = changed(labels, change)
+    ct = Volume(ct.data[: len(bad.data)], ct.lps_from_index)
+    with pytest.raises(InputError, match=message) as caught:
+        cut_out(ct, bad, 1, head, "left", 95.0)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_head_outside_the_label_is_refused(solids: Solids) -> None:
+    with pytest.raises(InputError, match="does not lie in the label"):
+        cut_out(solids[0], solids[1], 1, HEAD_OUTSIDE, "left", 95.0)
+
+
+HEAD_OUTSIDE = np.array([20.0, 30.0, 130.0])
+
+
+def test_no_calibration_is_told_in_one_line(solids: Solids) -> None:
+    bone_only = np.full((20, 20, 20), 300.0, np.float32)
+    with pytest.raises(InputError, match="no peak of air"):
+        calibrate(bone_only, CalibrationSettings("internal", **RIGHT_KIND))
+    with pytest.raises(InputError, match="at least two rods"):
+        CalibrationSettings("phantom", [(0.0, 0.0)], "ha", (0.0, 0.0, 0.0))
+    falling = CalibrationSettings("phantom", [(0.0, 100.0), (100.0, 0.0)], "ha", (0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="density falls"):
+        calibrate(bone_only, falling)
+
+
+def test_uncalibrated_says_so(solids: Solids) -> None:
+    found = calibrate(solids[0].data.numpy(), CalibrationSettings("uncalibrated", **RIGHT_KIND))
+    assert found.kind == "uncalibrated"
+    assert found.references == {}
+
+
+def test_presets_are_checked(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text("extends: default\nmesh: {size_mm: -3}\n")
+    with pytest.raises(InputError, match="size_mm"):
+        load_planning(path)
+    path.write_text("extends: default\nmesh: {sise_mm: 3}\n")
+    with pytest.raises(InputError, match="sise_mm"):
+        load_planning(path)
