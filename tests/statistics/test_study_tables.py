@@ -11,6 +11,9 @@ import pytest
 from rich.console import Console
 from study_frames import made_up, refuse
 
+from femoreg_torch.statistics.cause_tables import dependence_table
+from femoreg_torch.statistics.course_tables import round_table
+from femoreg_torch.statistics.error_tables import metric_table, pose_table
 from femoreg_torch.statistics.formats import (
     Table,
     between,
@@ -24,18 +27,9 @@ from femoreg_torch.statistics.formats import (
     write_tables,
 )
 from femoreg_torch.statistics.quantities import METRICS, PAPER_TRIALS, POSE_QUANTITIES
-from femoreg_torch.statistics.tables import (
-    coverage_table,
-    dependence_table,
-    group_tables,
-    metric_table,
-    overview_table,
-    pose_table,
-    round_table,
-    success_table,
-    trust_table,
-)
+from femoreg_torch.statistics.tables import group_tables, overview_table
 from femoreg_torch.statistics.trials import trial_table
+from femoreg_torch.statistics.trust_tables import coverage_table, success_table, trust_table
 
 ODD = Table(
     "odd",

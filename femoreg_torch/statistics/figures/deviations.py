@@ -9,6 +9,7 @@ from femoreg_torch.statistics.outcome import told
 from femoreg_torch.statistics.quantities import AXES, OBJECTS
 
 _MARKS = ("o", "s", "^")
+_FOOT = 0.02  # of the smallest deviation: errors below lie outside a panel, as a logarithm has no 0
 
 
 def deviations(rows: pd.DataFrame) -> Plot | None:
@@ -26,7 +27,8 @@ def deviations(rows: pd.DataFrame) -> Plot | None:
     caption = (
         "Absolute error of every run against the standard deviation that it states of itself, along (mm) and about (°) "
         "each axis of view 1. Below the solid line errors are within one deviation, below the dotted one within two: "
-        "68.3 % and 95.4 % of them, if the deviations are right and the errors normal."
+        "68.3 % and 95.4 % of them, if the deviations are right and the errors normal. Errors below a fiftieth of the "
+        "smallest deviation lie outside a panel."
     )
     return Plot("deviations", "Stated deviations and true errors", caption, figure)
 
@@ -43,9 +45,8 @@ def _panel(axes: Axes, rows: pd.DataFrame, name: str, unit: str) -> None:
     for axis, colour, mark in zip(AXES, COLOURS[1:], _MARKS, strict=False):
         sigma, error = _pairs(rows, name, unit, axis)
         alpha = max(0.15, min(0.7, 60 / max(1, len(sigma))))
-        floor = np.maximum(error, 0.01 * sigma)  # smaller errors stand at the foot: a logarithm has no 0
         axes.plot(
-            sigma, floor, mark, color=colour, markersize=2.2, markeredgewidth=0, alpha=alpha, label=axis.upper(),
+            sigma, error, mark, color=colour, markersize=2.2, markeredgewidth=0, alpha=alpha, label=axis.upper(),
             rasterized=True,
         )  # fmt: skip
         ratios.append(error / sigma)
@@ -56,6 +57,7 @@ def _panel(axes: Axes, rows: pd.DataFrame, name: str, unit: str) -> None:
     axes.plot(ends, ends, "-", color=QUIET, linewidth=0.8, label="1 σ")
     axes.plot(ends, 2 * ends, ":", color=QUIET, linewidth=0.8, label="2 σ")
     axes.set_xlim(low, high)
+    axes.set_ylim(bottom=_FOOT * low)
     for scale, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
         logarithmic(scale, np.log10(high / low))
     told_unit = "mm" if unit == "mm" else "°"
