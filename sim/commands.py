@@ -171,7 +171,7 @@ def study(
         config: Protocol in configs/study, or a YAML file: `paper`, `closed_loop`, `dose`, … (see docs/study.md).
         out: Folder of the runs and of the table.
         procedures: The first so many procedures; as many as the protocol says, if not given.
-        jobs: Procedures at the same time, on one core each; each needs some 3 GB of memory.
+        jobs: Procedures at the same time, on one core each; each needs up to 4 GB of memory.
         scheduler: Address of a Dask scheduler, whose workers then do the work in place of this machine.
         data: Folder with meshes/SUBJECT.npz of real bones, for protocols that name `subjects`.
         keep_cases: Keep the simulated case folders in OUT/cases, some 50 MB each.

@@ -3,7 +3,7 @@
 Mirrored patients, views and devices, a view told three times, the CT of somebody else, a femur that has broken since
 the CT, a device that is bent.
 
-A registration of such a case cannot be right, and must say so.
+A registration of such a case is not to be trusted, and should say so.
 """
 
 import math
