@@ -171,7 +171,7 @@ def study(
         config: Protocol in configs/study, or a YAML file: `paper`, `closed_loop`, `dose`, … (see docs/study.md).
         out: Folder of the runs and of the table.
         procedures: The first so many procedures; as many as the protocol says, if not given.
-        jobs: Procedures at the same time, on one core each; each needs some 3 GB of memory.
+        jobs: Procedures at the same time, on one core each; each needs up to 4 GB of memory.
         scheduler: Address of a Dask scheduler, whose workers then do the work in place of this machine.
         data: Folder with meshes/SUBJECT.npz of real bones, for protocols that name `subjects`.
         keep_cases: Keep the simulated case folders in OUT/cases, some 50 MB each.
@@ -192,7 +192,7 @@ def study(
     from femoreg_torch.errors import InputError
     from sim.study.engine import Executor
     from sim.study.executors import OnCluster, OnThisMachine
-    from sim.study.study import plan_study, run_study
+    from sim.study.study import RECORDED, plan_study, run_study
 
     if jobs < 1:
         raise InputError(f"--jobs: at least 1 was expected, got {jobs}.")
@@ -215,7 +215,8 @@ def study(
 
         told = run_study(plan, out, executor, reuse, begin, lambda done: progress.advance(task, done))
     counts = ", ".join(f"{count} {status}" for status, count in sorted(told.status.items()))
-    console.print(f"Simulated runs: {counts}; of those done, {told.flagged} are not trusted.")
+    what = "Runs on recorded cases" if all(run.kind == RECORDED for run in plan.runs) else "Simulated runs"
+    console.print(f"{what}: {counts}; of those done, {told.flagged} are not trusted.")
     if told.first_failure is not None:
         console.print(f"[bold red]Failed[/], first of them: {escape(told.first_failure)}")
     console.print(f"Table written to {told.table}.", markup=False)

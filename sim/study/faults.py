@@ -3,11 +3,12 @@
 Mirrored patients, views and devices, a view told three times, the CT of somebody else, a femur that has broken since
 the CT, a device that is bent.
 
-A registration of such a case cannot be right, and must say so.
+A registration of such a case is not to be trusted, and should say so.
 """
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from sim.patient import make_patient, write_patient
 _SOMEBODY_ELSE = 990001  # seed of a patient that no study images
 _BREAK_MM, _BREAK_DEG = 32.0, 20.0  # where the neck breaks, from the centre of the head, and how far the head turns
 _SOFT_TISSUE_HU = 40.0
-_BEND_MM = 6.0
+_BEND_MM, _SLIGHT_BEND_MM = 12.0, 6.0  # at 100 mm from the base: the tip is then told some 5 mm, or 2 mm, wrongly
 _LABELS = "femoreg"  # the table of the ids in these cases
 
 
@@ -137,12 +138,12 @@ def break_femur(folder: Path) -> None:
     write_volume(folder / "labels.nii.gz", labels.with_data(torch.from_numpy(new_labels)))
 
 
-def bend_device(folder: Path) -> None:
-    """Bend the device's surface across its guide, by 6 mm at 100 mm from its base; the named points stay."""
+def bend_device(folder: Path, by_mm: float = _BEND_MM) -> None:
+    """Bend the device's surface across its guide, by so much at 100 mm from its base; the named points stay."""
     path = folder / f"{DEVICE}.stl"
     mesh = read_mesh(path)
     vertices = mesh.vertices.copy()
-    vertices[:, 1] += _BEND_MM * (vertices[:, 2] / 100) ** 2
+    vertices[:, 1] += by_mm * (vertices[:, 2] / 100) ** 2
     mesh.vertices = vertices
     mesh.export(path)
 
@@ -155,6 +156,7 @@ FAULTS: dict[str, Callable[[Path], None]] = {
     "another patient": take_another_patient,
     "fractured femur": break_femur,
     "bent device": bend_device,
+    "slightly bent device": partial(bend_device, by_mm=_SLIGHT_BEND_MM),
 }
 
 

@@ -54,7 +54,7 @@ def plan_study(config: str, procedures: int | None, out: Path, data: Path | None
     if protocol.cases:
         return _of_cases(protocol, name, settings, count)
     real = bool(data is not None and protocol.subjects)
-    stores = Stores(out / "cases", out / "patients", data or Path())
+    stores = Stores(out / "cases", out / "patients", (data or Path()).resolve())
     subjects = protocol.subjects if real else []
     _check_meshes(stores, subjects)
     cohort = {"seed": protocol.seed, "first_patient": protocol.first_patient, "subjects": subjects}
@@ -166,8 +166,12 @@ def _build_patients(study: Study, todo: Sequence[Run]) -> None:
 
 def _records(store: Store, runs: Sequence[Run], reuse: bool) -> list[Record]:
     """Those of this code, or with `reuse` of any, in the order of the runs."""
-    found = (store.record(run) for run in runs)
-    return [record for record in found if record is not None and (reuse or record["code"] == store.code)]
+    found = ((run, store.record(run)) for run in runs)
+    return [
+        record | {"study": run.study, "varied": dict(run.varied)}  # as the protocol has them now: they change no result
+        for run, record in found
+        if record is not None and (reuse or record["code"] == store.code)
+    ]
 
 
 def _told(records: Sequence[Record], table: Path) -> Told:

@@ -22,7 +22,7 @@ from femoreg_torch.volume import (
 )
 from sim.patient import Patient
 from sim.study.faults import (
-    bend_device,
+    FAULTS,
     break_femur,
     mirror_device,
     mirror_patient,
@@ -142,11 +142,12 @@ def test_the_neck_breaks_and_the_shaft_stays(tmp_path: Path) -> None:
     assert (ct.data[(labels == 5) & (after.data == 0)] == 40).all()  # soft tissue where the neck was
 
 
-def test_a_bent_device_is_closed_and_its_base_stays(folder: Path) -> None:
+@pytest.mark.parametrize(("fault", "bend_mm"), [("bent device", 12), ("slightly bent device", 6)])
+def test_a_bent_device_is_closed_and_its_base_stays(fault: str, bend_mm: float, folder: Path) -> None:
     straight = trimesh.load_mesh(folder / f"{DEVICE}.stl")
-    bend_device(folder)
+    FAULTS[fault](folder)
     bent = trimesh.load_mesh(folder / f"{DEVICE}.stl")
     assert bent.is_volume
     assert bent.volume == pytest.approx(straight.volume)
     shift = bent.bounds[1] - straight.bounds[1]
-    assert shift == pytest.approx([0, 6 * 0.15**2, 0])
+    assert shift == pytest.approx([0, bend_mm * 0.15**2, 0])

@@ -70,7 +70,7 @@ def test_a_command_that_is_killed_three_times_ends_as_an_undisturbed_one(
 
 
 def wait_for_runs(out: Path, count: int, process: Any) -> None:
-    until = time.monotonic() + 60
+    until = time.monotonic() + 600  # on a machine that does much else
     while len(list((out / "runs").glob("*.json"))) < count:
         assert time.monotonic() < until
         assert process.is_alive()

@@ -125,3 +125,16 @@ def test_real_bones_that_are_there_are_every_second_patient(tmp_path: Path) -> N
     assert [run.kind for run in with_them] == ["procedural", "real"] * 2
     assert [run.procedure.patient for run in with_them] == ["10001", "bmf", "10003", "gias2"]
     assert not {run.name for run in without} & {run.name for run in with_them}  # they do not mix
+
+
+def test_the_page_on_studies_names_every_preset_and_its_examples_can_be_read(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "study.md").read_text(encoding="utf-8")
+    for name in PROTOCOLS:
+        assert f"`{name}`" in page
+    varying, recorded = (block.split("```")[0] for block in page.split("```yaml\n")[1:])
+    (tmp_path / "varying.yaml").write_text(varying, encoding="utf-8")
+    protocol = load_protocol(tmp_path / "varying.yaml")
+    assert [variation.name for variation in protocol.vary][:2] == ["paper", "low_dose"]
+    settings_of(protocol, "varying")
+    (tmp_path / "recorded.yaml").write_text(recorded, encoding="utf-8")
+    assert load_protocol(tmp_path / "recorded.yaml").cases == ["recordings/*", "another/case"]
