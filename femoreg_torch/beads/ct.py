@@ -1,14 +1,14 @@
 """Beads in a CT: small round spots brighter than bone, their centres measured to a fraction of a voxel.
 
-A bead of 1 mm is about as large as a voxel, so what the CT shows is its blur: nearly a Gaussian, whose centre is fitted
-to all voxels within some millimetres, over a plane for the bone around. Voxels that the scanner has clipped are left
-out. The paper labelled its beads in the CT by hand (section III-B).
+A bead of 1 mm is about as large as a voxel, so what the CT shows is its blur, nearly a Gaussian. Its share in every
+voxel within some millimetres is fitted, over a plane for the bone around: the centre follows from partial volumes.
+Voxels that the scanner has clipped are left out. The paper labelled its beads in the CT by hand (section III-B).
 """
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, special
 from scipy.optimize import least_squares
 from torch import Tensor
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 _ABOVE_HU = 700.0  # over the tissue around: trabecular bone stays 300 below its neighbours, cortical bone is no spot
 _AROUND_MM = 7.0  # edge of the box whose mean is the tissue around
 _WINDOW_MM = 2.5  # of the fit beyond the bead's radius
-_BLUR_MM = (0.15, 1.1)  # standard deviation of scanner and voxel together: half a voxel of 0.5 mm, a soft kernel
+_BLUR_MM = (0.15, 1.1)  # standard deviation of the scanner: sharper than any, a soft kernel
 _OBLONG = 1.7  # most by which a bead is longer than wide, of its blurred deviations
 _EXPLAINED = 0.80  # least share of the variance in the window that the fit explains
 _CANDIDATES = 100  # that are fitted, those that stand out most first
@@ -53,12 +53,15 @@ def find_beads(ct: Volume, diameter_mm: float, count: int, within: Tensor | None
     peaks = (stands_out > _ABOVE_HU) & (part == ndimage.maximum_filter(part, 3))
     if within is not None:
         peaks &= within.numpy()[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
-    index = np.argwhere(peaks)
-    index = index[np.argsort(-stands_out[peaks], kind="stable")][:_CANDIDATES] + low
+    plateaus, number = ndimage.label(peaks, np.ones((3, 3, 3)))  # a clipped bead has many voxels as bright
+    numbers = np.arange(1, number + 1)
+    index = np.round(np.array(ndimage.center_of_mass(peaks, plateaus, numbers)).reshape(-1, 3)).astype(int)
+    contrasts = np.asarray(ndimage.maximum(stands_out, plateaus, numbers))
+    best = np.argsort(-contrasts, kind="stable")[:_CANDIDATES]
+    index, contrasts = index[best] + low, contrasts[best]
     largest = float(part.max())
     clip = largest if (part >= largest).sum() >= _CLIPPED else np.inf
     found: list[Array] = []  # (x, y, z index, mass)
-    contrasts = stands_out[tuple((index - low).T)]
     faintest = np.inf
     for (z, y, x), contrast in zip(index, contrasts, strict=True):
         if len(found) >= count and contrast < _RIVAL * faintest:
@@ -113,31 +116,38 @@ def _fitted(data: NDArray[np.floating], start: Array, spacing: Array, diameter_m
         return None
 
     def solved(parameters: Array) -> tuple[Array, float]:
-        bead = np.exp(-(((places - parameters[:3]) / parameters[3:]) ** 2).sum(1) / 2)
+        sizes = parameters[[3, 3, 4]] * np.sqrt(2)  # a scanner blurs alike along x and y
+        rim = [special.erf((places - parameters[:3] + side * spacing / 2) / sizes) for side in (1, -1)]
+        bead = np.prod((rim[0] - rim[1]) / 2, axis=1)  # share of the blurred bead in each voxel
         terms = np.column_stack([bead, plane])
         linear = np.linalg.lstsq(terms, values, rcond=None)[0]
         return values - terms @ linear, float(linear[0])
 
     ball = diameter_mm / 2 / np.sqrt(5)  # deviation of a full sphere along an axis
     lowest, highest = (float(np.hypot(ball, blur)) for blur in _BLUR_MM)
-    first = np.array([0.0, 0, 0, *np.hypot(ball, np.maximum(0.5, spacing / 2))])
-    edge = float(spacing.max()) + diameter_mm / 2  # a clipped bead is a plateau, which may begin at its rim
-    bounds = ([-edge] * 3 + [lowest] * 3, [edge] * 3 + [highest] * 3)
+    first = np.array([0.0, 0, 0, *np.hypot(ball, np.array([0.5, 0.5]))])
+    edge = float(spacing.max()) + diameter_mm / 2
+    bounds = ([-edge] * 3 + [lowest] * 2, [edge] * 3 + [highest] * 2)
     fit = least_squares(
         lambda p: solved(p)[0], first.clip(*bounds), bounds=bounds, x_scale=0.1, xtol=1e-5, max_nfev=_STEPS
     )
-    residuals, height = solved(fit.x)
+    residuals, share = solved(fit.x)
     sizes = fit.x[3:]
     explained = 1 - float((residuals**2).sum()) / max(float(((values - values.mean()) ** 2).sum()), 1e-9)
     if (
-        height < _ABOVE_HU
+        share * _largest_share(sizes, spacing) < _ABOVE_HU
         or explained < _EXPLAINED
         or sizes.max() > _OBLONG * sizes.min()
         or sizes.max() > 0.98 * highest
     ):
         return None
-    mass = height * (2 * np.pi) ** 1.5 * float(np.prod(sizes))
+    mass = share * float(np.prod(spacing))
     return np.array([*(start + fit.x[:3] / spacing), mass])
+
+
+def _largest_share(sizes: Array, spacing: Array) -> float:
+    """Share of a blurred bead that a voxel about its centre holds."""
+    return float(np.prod(special.erf(spacing / 2 / (sizes[[0, 0, 1]] * np.sqrt(2)))))
 
 
 def _small(part: Array, places: Array, diameter_mm: float) -> bool:

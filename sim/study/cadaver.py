@@ -1,10 +1,11 @@
 """`python -m sim.study.cadaver`: a simulated cadaver study, and what of its errors is the ground truth's own.
 
 One computed specimen has seven beads in its femur and a device five on its surface. In every trial six images are made
-with the beads in the beam, and a CT with the beads in the bone. Three truths are then held against each registration:
+with the beads in the beam, and a CT with the beads in the bone. Truths of three kinds are then held against each
+registration:
 
 - `measured`: all beads found in CT and images by `femoreg_torch.beads`, all views fitted at once;
-- `by hand`: the paper's way (section III-B), picked with the settings' noise in the first view alone;
+- of some hands: the paper's way (section III-B), picked with the settings' noise in the first view alone;
 - `exact`: what the simulation knows, which no cadaver study has.
 
 The registration sees images and a CT from which the beads have been taken out (filled from around).
@@ -59,7 +60,7 @@ from sim.theatre.preoperative_case import Preoperative, read_preoperative
 from sim.theatre.procedure import draw_procedure
 from sim.theatre.settings import load_simulation
 
-TRUTHS = ("measured", "by_hand", "exact")
+MEASURED, EXACT = "measured", "exact"
 _ROMAN = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII", "IX", "X")
 _BEADS_NAME, _PLACED_NAME, _RECORD_NAME = "beads.yaml", "placed_beads.json", "record.json"
 
@@ -87,6 +88,7 @@ class DeviceBeads:
 class ByHand:
     """How well a person picks beads, standard deviations along each axis."""
 
+    name: str
     image_noise_px: float
     bead_noise_mm: float
 
@@ -105,7 +107,7 @@ class CadaverStudy:
     femur_beads: FemurBeads
     device_beads: DeviceBeads
     ct_blur_mm: float
-    by_hand: ByHand
+    by_hand: list[ByHand]
 
     def __post_init__(self) -> None:
         if not 1 <= self.trials <= len(_ROMAN):
@@ -213,11 +215,14 @@ def run_trial(study: CadaverStudy, case: Path, out: Path, number: int) -> dict[s
         register_into(run, out, study.preset, number)
     result = read_result(run)
     points = bead_points(procedure, (FEMUR, DEVICE))
-    seed = study.first_seed + number
-    hand, hand_deviations = _by_hand(study, procedure, read_json(case / _PLACED_NAME), found.beads, seed)
     own = metric_deviations(pose_uncertainty(found.bundle, points), found.bundle.poses, points)
-    truths = {"measured": found.bundle.poses, "by_hand": hand, "exact": _without_pelvis(truth)}
-    deviations = {"measured": own, "by_hand": hand_deviations, "exact": dict.fromkeys(NAMES, 0.0)}
+    truths, deviations = {MEASURED: found.bundle.poses}, {MEASURED: own}
+    for hand in study.by_hand:
+        truths[hand.name], deviations[hand.name] = _by_hand(
+            hand, procedure, read_json(case / _PLACED_NAME), found.beads, study.first_seed + number
+        )
+    told = list(truths)
+    truths[EXACT], deviations[EXACT] = _without_pelvis(truth), dict.fromkeys(NAMES, 0.0)
     record = {
         "trusted": result.verdict.trusted,
         "shadow_noise_px": found.bundle.deviation_px,
@@ -225,8 +230,8 @@ def run_trial(study: CadaverStudy, case: Path, out: Path, number: int) -> dict[s
         "errors": {name: _metrics(errors(poses, result.poses, points)) for name, poses in truths.items()},
         "deviations": deviations,
         "truth_errors": {
-            name: _truth_errors(errors(truths["exact"].first_views(1), truths[name].first_views(1), points))
-            for name in ("measured", "by_hand")
+            name: _truth_errors(errors(truths[EXACT].first_views(1), truths[name].first_views(1), points))
+            for name in told
         },
         "bead_errors_mm": _bead_errors(read_json(case / _PLACED_NAME), found.beads),
     }
@@ -260,23 +265,23 @@ def _bead_errors(placed: dict[str, Any], beads: Sequence[Beads]) -> dict[str, fl
 
 
 def _by_hand(
-    study: CadaverStudy, case: Case, placed: dict[str, Any], beads: Sequence[Beads], seed: int
+    hand: ByHand, case: Case, placed: dict[str, Any], beads: Sequence[Beads], seed: int
 ) -> tuple[Poses, dict[str, float]]:
     """Poses from beads that a person has picked in CT and first view, and what they leave open of each metric."""
     assert case.truth is not None
     generator = torch.Generator().manual_seed(seed)
-    camera, noise = case.carm.camera, study.by_hand
+    camera = case.carm.camera
     picked, sights = [], []
     for thing in beads:
         true = torch.tensor(placed[thing.object], dtype=torch.float64)
-        shift = noise.bead_noise_mm * torch.randn(true.shape, generator=generator, dtype=torch.float64)
+        shift = hand.bead_noise_mm * torch.randn(true.shape, generator=generator, dtype=torch.float64)
         names = tuple(map(str, range(len(true))))
-        picked.append(Beads(thing.object, names, true + shift, thing.diameter_mm, noise.bead_noise_mm))
+        picked.append(Beads(thing.object, names, true + shift, thing.diameter_mm, hand.bead_noise_mm))
         exact = project_points(camera, transform_points(case.truth.camera1_from[thing.object], true))
-        seen = exact + noise.image_noise_px * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
+        seen = exact + hand.image_noise_px * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
         sights += [Sight(thing.object, n, 0, "view 1", (c, r)) for n, (c, r) in enumerate(seen.tolist())]
     start = replace(_without_pelvis(case.truth), camera_from_camera1=torch.eye(4, dtype=torch.float64)[None])
-    found = bundle(picked, sights, start, camera, noise.image_noise_px)
+    found = bundle(picked, sights, start, camera, hand.image_noise_px)
     points = bead_points(case, (FEMUR, DEVICE))
     return found.poses, metric_deviations(pose_uncertainty(found, points), found.poses, points)
 
@@ -287,7 +292,7 @@ def write_results(study: CadaverStudy, records: dict[str, dict[str, Any]], out: 
         writer = csv.writer(file)
         writer.writerow(["trial", "truth", "trusted", *NAMES, *(f"truth_{key}" for key in NAMES)])
         for name, record in records.items():
-            for truth in TRUTHS:
+            for truth in record["errors"]:
                 values = [record["errors"][truth][key] for key in NAMES]
                 own = [record["deviations"][truth][key] for key in NAMES]
                 writer.writerow([name, truth, int(record["trusted"]), *values, *own])
@@ -299,11 +304,11 @@ def write_results(study: CadaverStudy, records: dict[str, dict[str, Any]], out: 
 def _error_table(records: dict[str, dict[str, Any]]) -> str:
     rows = []
     for key, title in NAMES.items():
-        for truth in TRUTHS:
+        for truth in next(iter(records.values()))["errors"]:
             values = [record["errors"][truth][key] for record in records.values()]
             own = math.sqrt(float(np.mean([record["deviations"][truth][key] ** 2 for record in records.values()])))
-            told = "–" if truth == "exact" else f"{own:.2f}"
-            label = f"{title}, against {truth.replace('_', ' ')} truth"
+            told = "–" if truth == EXACT else f"{own:.2f}"
+            label = f"{title}, truth: {truth}"
             rows.append([label, *(f"{value:.2f}" for value in values), _mean(values), told])
         paper = PAPER_TRIALS[key]
         shown = [f"{value:.2f}" for value in paper] if len(paper) == len(records) else [""] * len(records)
@@ -313,16 +318,14 @@ def _error_table(records: dict[str, dict[str, Any]]) -> str:
 
 def _truth_table(records: dict[str, dict[str, Any]]) -> str:
     rows = []
-    for truth in ("measured", "by_hand"):
+    for truth in next(iter(records.values()))["truth_errors"]:
         for name in (FEMUR, DEVICE):
             for unit, key in (("mm", "mm"), ("°", "deg")):
                 values = [record["truth_errors"][truth][name][key] for record in records.values()]
-                rows.append(
-                    [f"{truth.replace('_', ' ')}, {name}, {unit}", *(f"{v:.2f}" for v in values), _mean(values)]
-                )
+                rows.append([f"{truth}: {name}, {unit}", *(f"{v:.2f}" for v in values), _mean(values)])
         for key, title in NAMES.items():
             values = [record["truth_errors"][truth][key] for record in records.values()]
-            rows.append([f"{truth.replace('_', ' ')}, {title}", *(f"{v:.2f}" for v in values), _mean(values)])
+            rows.append([f"{truth}: {title}", *(f"{v:.2f}" for v in values), _mean(values)])
     return table(["error of the truth itself", *records, "mean ± SD"], rows)
 
 

@@ -154,3 +154,12 @@ def test_without_a_device_only_bone_is_told(truth):
 def test_another_number_of_views_is_refused(truth):
     with pytest.raises(InputError, match="3 views"):
         errors(truth, truth.first_views(2), POINTS)
+
+
+def test_a_truth_of_the_first_view_without_the_first_object_tells_of_the_rest(truth):
+    """What beads in one image give: the same rows as the whole truth, but for the views and the pelvis."""
+    estimate = truth.with_object("femur", shifted(truth.camera1_from["femur"], z=2.0))
+    whole = errors(truth, estimate, POINTS)
+    part = errors(without(truth, "pelvis").first_views(1), estimate, POINTS)
+    assert part == {key: row for key, row in whole.items() if key not in ("pelvis", "view2", "view3")}
+    assert part["relative_mm"] == pytest.approx(2.0)
