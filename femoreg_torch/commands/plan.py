@@ -104,14 +104,19 @@ def plan_robustness(
     from rich.console import Console
 
     from femoreg_torch.commands.telling import progress_report
+    from femoreg_torch.errors import InputError
     from femoreg_torch.files import write_json
     from femoreg_torch.planning.figures import robustness_figure, save
     from femoreg_torch.planning.offsets import study_offsets
     from femoreg_torch.planning.replan import Replan
+    from femoreg_torch.planning.report import read_plan
 
     console = Console()
+    count = read_plan(plan).planning.robustness.draws if draws is None else draws
+    if count < 1:
+        raise InputError(f"--draws: 1 or more was expected, found {count}.")
+    offsets = study_offsets(study, count, seed)  # first: the femur takes a while
     again = Replan(plan, case)
-    offsets = study_offsets(study, draws or again.stored.planning.robustness.draws, seed)
     with progress_report(console, "draws") as report:
         outcomes = []
         for n, offset in enumerate(offsets):
