@@ -112,19 +112,19 @@ def test_derivatives_are_those_of_differences() -> None:
 def test_covariance_is_that_of_monte_carlo(noise_px: float, bead_mm: float, views: int) -> None:
     """The mean squared Mahalanobis length of 12 errors is 12; single deviations agree within their sampling error."""
     changes, lengths = [], []
-    for seed in range(60):
+    for seed in range(24):
         found = bundle(beads(bead_mm), sights(noise_px, bead_mm, seed, views), off(views), CAMERA, noise_px)
         sure = pose_uncertainty(found, POINTS)
         twist = change(found.poses)
         changes.append(twist)
         lengths.append(float(twist @ torch.linalg.solve(sure.covariance, twist)))
-    assert np.mean(lengths) == pytest.approx(12, abs=3.5 * np.sqrt(24 / 60))
+    assert np.mean(lengths) == pytest.approx(12, abs=3.5 * np.sqrt(24 / 24))
     ratio = torch.stack(changes).pow(2).mean(0).sqrt() / sure.covariance.diagonal().sqrt()
-    assert ((ratio > 0.65) & (ratio < 1.4)).all()
+    assert ((ratio > 0.5) & (ratio < 1.6)).all()
 
 
 def test_estimated_noise_is_that_of_the_shadows() -> None:
-    estimates = [bundle(beads(0.1), sights(0.4, 0.1, seed), off(), CAMERA) for seed in range(12)]
+    estimates = [bundle(beads(0.1), sights(0.4, 0.1, seed), off(), CAMERA) for seed in range(10)]
     assert all(found.estimated for found in estimates)
     assert np.mean([found.deviation_px for found in estimates]) == pytest.approx(0.4, rel=0.12)
 
@@ -144,7 +144,7 @@ def test_metrics_agree_with_monte_carlo() -> None:
     """What the beads leave open of the paper's errors, against the errors of many noisy truths."""
     samples: dict[str, list[float]] = {}
     rows: list[dict[str, float]] = []
-    for seed in range(60):
+    for seed in range(24):
         found = bundle(beads(0.1), sights(0.5, 0.1, seed), off(), CAMERA, 0.5)
         told = errors(TRUE, found.poses, POINTS)
         for key, value in metric_deviations(pose_uncertainty(found, POINTS), found.poses, POINTS).items():
@@ -152,7 +152,7 @@ def test_metrics_agree_with_monte_carlo() -> None:
             rows.append({key: value})
     for key, values in samples.items():
         expected = next(row[key] for row in rows if key in row)
-        assert np.sqrt(np.mean(np.square(values))) == pytest.approx(expected, rel=0.3), key
+        assert np.sqrt(np.mean(np.square(values))) == pytest.approx(expected, rel=0.4), key
     assert set(samples) == {"entry_point_mm", "tip_mm", "relative_mm", "path_deg", "guide_deg"}
 
 
@@ -168,11 +168,11 @@ def test_rows_are_told_along_the_axes_of_the_paper() -> None:
 
 def test_views_are_as_sure_as_monte_carlo_says() -> None:
     sources = []
-    for seed in range(50):
+    for seed in range(20):
         found = bundle(beads(0.1), sights(0.5, 0.1, seed), off(), CAMERA, 0.5)
         apart = invert_rigid(found.poses.camera_from_camera1[2]) - invert_rigid(TRUE.camera_from_camera1[2])
         sources.append(float(apart[:3, 3].norm()))
-    assert np.sqrt(np.mean(np.square(sources))) == pytest.approx(view_rows(found)["view3"]["mm"], rel=0.3)
+    assert np.sqrt(np.mean(np.square(sources))) == pytest.approx(view_rows(found)["view3"]["mm"], rel=0.4)
 
 
 def test_more_views_know_more() -> None:
