@@ -24,6 +24,7 @@ from statistics import median
 from measure import machine, table, write_section
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+_WAITING = {"GOMP_SPINCOUNT": "1000"}  # as `femoreg_torch` sets it where it is imported before torch
 # Rows, and the functions whose time, with all that they call, is theirs: file and name.
 _STAGES = {
     "patient: bones": [("procedural/bones.py", "build_skeleton")],
@@ -71,7 +72,7 @@ def procedure(spacings_mm: tuple[float, float]) -> None:
 def one_run(cores: int, checkout: Path, spacings_mm: tuple[float, float] = (1.0, 0.75)) -> Seconds:
     """Seconds by row of one run of the code in a checkout, the wall clock, and the most memory, MiB."""
     available = sorted(os.sched_getaffinity(0))[:cores]
-    environment = os.environ | dict.fromkeys(_THREADS, str(cores)) | {"PYTHONPATH": str(checkout)}
+    environment = os.environ | dict.fromkeys(_THREADS, str(cores)) | {"PYTHONPATH": str(checkout), **_WAITING}
     arguments = [sys.executable, str(Path(__file__).resolve()), "--procedure", *map(str, spacings_mm)]
     done = subprocess.run(
         arguments,
