@@ -91,9 +91,7 @@ def plan_robustness(
 ) -> None:
     """Carry a plan out under the errors of a study's registrations, and tell how its gain is distributed.
 
-    Writes robustness.json and robustness.png into PLAN. Errors are drawn from the trusted runs of the study. Where
-    cement spreads anew, an injection starts at the nearest block of `diffusion.voxel_mm`: errors below half of that may
-    change nothing, and that is no sign of robustness.
+    Writes robustness.json and robustness.png into PLAN. Errors are drawn from the trusted runs of the study.
 
     Args:
         plan: Folder that `femoreg plan` wrote.
@@ -130,12 +128,6 @@ def plan_robustness(
     write_json(plan / "robustness.json", again.content({"draws": outcomes}) | spread)
     save(robustness_figure(outcomes, again.baseline_n, again.planned_n), plan / "robustness.png")
     least = min(outcome.clearance_mm for outcome in outcomes)
-    block_mm = again.stored.planning.diffusion.voxel_mm
-    if again.stored.planning.offsets.moves == "path" and np.linalg.norm(offsets, axis=1).max() < block_mm / 2:
-        console.print(
-            f"All errors are below half a block of the diffusion ({block_mm:g} mm): injections start as planned, so "
-            "the gain cannot tell them apart."
-        )
     console.print(
         f"Modelled gain {again.gain(again.planned_n):+.1f} % as planned; under the study's errors {middle:+.1f} % "
         f"(5 to 95 %: {low:+.1f} to {high:+.1f} %). Least clearance {least:.1f} mm."

@@ -8,7 +8,7 @@ def report(study: Path, *, seed: int = 0) -> None:
 
     The page needs no network and no other file. Its tables are written to STUDY/tables too (see `femoreg tables`), its
     figures to STUDY/figures as PNG and SVG in the sizes of a journal; what these folders held before is replaced. Where
-    there is a picture STUDY/overlays/NAME.png of one of the worst runs, the page shows it.
+    there is a picture STUDY/overlays/NAME.jpg of one of the worst runs, the page shows it.
 
     Args:
         study: Folder with the runs of a study, runs.parquet.

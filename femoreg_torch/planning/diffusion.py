@@ -16,7 +16,7 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import cg
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.planning.mesh import blocks
+from femoreg_torch.planning.mesh import Blocks, blocks
 from femoreg_torch.planning.model import Bone, check_volume
 from femoreg_torch.planning.settings import DiffusionSettings
 
@@ -26,6 +26,7 @@ Ints = NDArray[np.int64]
 _FRONT_SHARE = 0.03  # of the blocks of the front filled at a time
 _FULL = 1 - 1e-9
 _LEAST_MARROW = 0.5  # of a block: less takes no cement
+_LEAST_SHARE = 1e-3  # of an injection that is worth a front of its own
 _REACH_BLOCKS = 2.5  # a source so near to marrow opens into it
 
 
@@ -54,22 +55,49 @@ def diffuse(bone: Bone, injections: Sequence[Injection], settings: DiffusionSett
     number[allowed] = np.arange(allowed.sum())
     places = np.argwhere(allowed)
     room = pores[allowed] * settings.voxel_mm**3 / 1000
-    sources = [_source(grid.centres(places), injection, settings.voxel_mm) for injection in injections]
     links = _links(number, permeability, (settings.across, settings.across, 1.0))
+    piece = _pieces(np.ones(len(room), bool), links[0], links[1])
+    centres = grid.centres(places)
+    sources = [_sources(grid, centres, injection.point, number, piece) for injection in injections]
     full = np.zeros(len(room))
-    for source, injection in zip(sources, injections, strict=True):
-        _inject(full, room, links, source, injection.volume_ml)
+    for around, injection in zip(sources, injections, strict=True):
+        for source, share_of_it in around:
+            _inject(full, room, links, source, share_of_it * injection.volume_ml)
     share = np.zeros(allowed.shape)
     share[allowed] = full
     # a voxel takes the mean of its blocks, so that blocks give away just what they hold
     return np.asarray(grid.spread(share) * bone.marrow)
 
 
-def _source(centres: Array, injection: Injection, size_mm: float) -> int:
-    distance = np.linalg.norm(centres - injection.point, axis=1)
+def _sources(grid: Blocks, centres: Array, point: Array, number: Ints, piece: Ints) -> list[tuple[int, float]]:
+    """The blocks of marrow around an injection at a point (3,), LPS mm, and the share that each receives.
+
+    The eight around it by trilinear interpolation, so that cement follows a path that moves by less than a block; of
+    these, those in one piece of marrow with the nearest. Where none is marrow, the nearest block that is.
+    """
+    place_in_blocks = grid.index(point)
+    low = np.floor(place_in_blocks).astype(int)
+    beyond = place_in_blocks - low
+    found = []
+    for corner in np.ndindex(2, 2, 2):
+        place = low + corner
+        if (place < 0).any() or (place >= number.shape).any() or number[tuple(place)] < 0:
+            continue
+        found.append((int(number[tuple(place)]), float(np.where(corner, beyond, 1 - beyond).prod())))
+    found = [(block, share) for block, share in found if share > _LEAST_SHARE]
+    if not found:
+        return [(_nearest(centres, point, grid.size_mm), 1.0)]
+    main = max(found, key=lambda entry: entry[1])[0]
+    found = [(block, share) for block, share in found if piece[block] == piece[main]]
+    total = sum(share for _, share in found)
+    return [(block, share / total) for block, share in found]
+
+
+def _nearest(centres: Array, point: Array, size_mm: float) -> int:
+    distance = np.linalg.norm(centres - point, axis=1)
     nearest = int(distance.argmin())
     if distance[nearest] > _REACH_BLOCKS * size_mm:
-        place = ", ".join(f"{v:.1f}" for v in injection.point)
+        place = ", ".join(f"{v:.1f}" for v in point)
         raise InputError(
             f"injection at ({place}) mm LPS lies {distance[nearest]:.0f} mm from any marrow: the path leaves the bone, "
             "or lies in its cortex. Move it."
@@ -157,7 +185,13 @@ def _front_flux(full: Array, links: tuple[Ints, Ints, Array], source: int, press
 
 def _connected(wet: NDArray[np.bool_], first: Ints, second: Ints, source: int) -> NDArray[np.bool_]:
     """Those of the full blocks that hang together with the source."""
+    piece = _pieces(wet, first, second)
+    return np.asarray(wet & (piece == piece[source]))
+
+
+def _pieces(wet: NDArray[np.bool_], first: Ints, second: Ints) -> Ints:
+    """A number (N,) for each block, the same for those that hang together."""
     both = wet[first] & wet[second]
     graph = sparse.coo_array((np.ones(both.sum()), (first[both], second[both])), shape=(len(wet), len(wet)))
     _, piece = csgraph.connected_components(graph.tocsr(), directed=False)
-    return np.asarray(wet & (piece == piece[source]))
+    return np.asarray(piece, np.int64)

@@ -42,6 +42,11 @@ class Blocks:
         """Middles (N, 3), LPS mm, of blocks (N, 3)."""
         return self.lps(np.asarray((index + 0.5) * self.size_mm, float))
 
+    def index(self, point: Array) -> Array:
+        """Fractional index (3,) of a point (3,), LPS mm; whole in the middles of blocks."""
+        mm = np.linalg.solve(self.lps_from_mm[:3, :3], point - self.lps_from_mm[:3, 3])
+        return np.asarray(mm / self.size_mm - 0.5)
+
     def lps(self, mm: Array) -> Array:
         """Points (N, 3), LPS mm, from mm along the index axes."""
         return np.asarray(mm @ self.lps_from_mm[:3, :3].T + self.lps_from_mm[:3, 3])

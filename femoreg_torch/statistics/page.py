@@ -3,6 +3,7 @@
 import base64
 from collections.abc import Iterable, Sequence
 from html import escape
+from typing import Literal
 
 STYLE = """
 :root { color-scheme: light; }
@@ -54,10 +55,10 @@ def cards(entries: Iterable[tuple[str, str, str]]) -> str:
     return f'<div class="cards">{"".join(boxes)}</div>'
 
 
-def image(png: bytes, alt: str, caption: str) -> str:
+def image(picture: bytes, alt: str, caption: str, kind: Literal["png", "jpeg"] = "png") -> str:
     """A picture within the page."""
-    source = base64.b64encode(png).decode("ascii")
-    shown = f'<img alt="{escape(alt)}" src="data:image/png;base64,{source}">'
+    source = base64.b64encode(picture).decode("ascii")
+    shown = f'<img alt="{escape(alt)}" src="data:image/{kind};base64,{source}">'
     return f'<figure><div class="wide">{shown}</div><figcaption>{escape(caption)}</figcaption></figure>'
 
 

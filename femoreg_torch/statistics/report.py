@@ -70,7 +70,7 @@ def report_page(
 ) -> str:
     """The text of the report. `tables` are those of `study_tables`, `pictures` those of every group of runs.
 
-    `overlays` is the folder in which there may be a picture NAME.png of a run.
+    `overlays` is the folder in which there may be a picture NAME.jpg of a run.
     """
     name = ", ".join(sorted(set(rows["study"])))
     first, *others = pictures
@@ -145,11 +145,10 @@ def _worst(rows: pd.DataFrame, overlays: Path) -> Iterator[str]:
     yield f'<p class="note">{escape(chosen_by)}</p>'
     yield listing(columns, lines)
     for _, row in chosen.iterrows():
-        path = overlays / f"{run_name(row)}.png"
+        path = overlays / f"{run_name(row)}.jpg"
         if path.is_file():
-            yield image(
-                path.read_bytes(), f"overlays of {run_name(row)}", f"{run_name(row)}: images with the result's edges."
-            )
+            caption = f"{run_name(row)}: images with the result's edges."
+            yield image(path.read_bytes(), f"overlays of {run_name(row)}", caption, "jpeg")
 
 
 def _untrusted(rows: pd.DataFrame) -> Iterator[str]:

@@ -36,6 +36,8 @@ def _of_round(record: Record) -> Row:
     row["asked"] = " ".join(record.get("asked", ()))
     row |= {key: record[key] for key in ("round", "before_mm", "before_deg", "left_mm", "left_deg") if key in record}
     row |= flat_errors(record.get("errors") or {}) | flat_errors(record.get("start_errors") or {}, "start_")
+    if record.get("pelvis_at_head_mm") is not None:
+        row["pelvis_at_head_mm"] = record["pelvis_at_head_mm"]
     for point, shift in (record.get("displacements_mm") or {}).items():
         row |= {f"{point}_mm_{axis}": part for axis, part in zip(_AXES, shift, strict=True)}
     for name, quality in record.get("quality", {}).items():

@@ -20,6 +20,7 @@ from sim.study.trial import kind
 from sim.study.work import Recorded, Setting, Simulated, settings_of
 
 _TABLE_S, _TABLE_SHARE = 60.0, 0.02  # the table is renewed so often, and takes at most this share of the time
+OVERLAYS = "overlays"  # folder of the runs' pictures
 RECORDED = "recorded"  # kind of a case that nobody simulated
 
 
@@ -52,7 +53,7 @@ def plan_study(config: str, procedures: int | None, out: Path, data: Path | None
         raise InputError(f"--procedures: at least 1 was expected, got {count}.")
     settings = settings_of(protocol, name)
     if protocol.cases:
-        return _of_cases(protocol, name, settings, count)
+        return _of_cases(protocol, name, settings, count, out)
     real = bool(data is not None and protocol.subjects)
     stores = Stores(out / "cases", out / "patients", (data or Path()).resolve())
     subjects = protocol.subjects if real else []
@@ -65,10 +66,10 @@ def plan_study(config: str, procedures: int | None, out: Path, data: Path | None
         for key in settings
     ]
     kept = stores.cases if keep_cases else None
-    return Study(runs, Simulated(settings, stores, kept), subjects, stores)
+    return Study(runs, Simulated(settings, stores, out.resolve() / OVERLAYS, kept), subjects, stores)
 
 
-def _of_cases(protocol: Protocol, name: str, settings: dict[str, Setting], count: int) -> Study:
+def _of_cases(protocol: Protocol, name: str, settings: dict[str, Setting], count: int, out: Path) -> Study:
     """A study of cases that are there, in the order of the list; those that a pattern finds by name."""
     found = dict.fromkeys(folder.resolve() for pattern in protocol.cases for folder in _matching(pattern))
     folders = [folder for folder in found if (folder / "case.yaml").is_file()][:count]
@@ -84,7 +85,7 @@ def _of_cases(protocol: Protocol, name: str, settings: dict[str, Setting], count
             if case.truth is None and (setting.detections or setting.variation.start):
                 raise InputError(f"{folder}: has no truth, from which `start` and `detections` could be drawn.")
             runs.append(_run(name, setting, procedure, digest(protocol.seed, setting.digest, content), RECORDED))
-    return Study(runs, Recorded(settings, cases))
+    return Study(runs, Recorded(settings, cases, out.resolve() / OVERLAYS))
 
 
 def _matching(pattern: str) -> list[Path]:

@@ -5,16 +5,18 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import torch
 from torch import Tensor
 
 from femoreg_torch.case import Case, Result, read_case
-from femoreg_torch.case.femoroplasty import PELVIS
+from femoreg_torch.case.femoroplasty import FEMUR, PELVIS
 from femoreg_torch.detect import load_network
 from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation import errors, path_displacements, reference_points
-from femoreg_torch.files import plain
-from femoreg_torch.geometry import Poses
+from femoreg_torch.evaluation import ReferencePoints, errors, overlay_figure, path_displacements, reference_points
+from femoreg_torch.evaluation.overlay import Picture
+from femoreg_torch.files import plain, temporary_file
+from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.registration import Plan
 from femoreg_torch.registration.run import register_scene
 from femoreg_torch.registration.scene import Scene
@@ -22,6 +24,8 @@ from femoreg_torch.registration.start import Detector
 from sim.study.detections import simulated_detector
 from sim.study.procedures import Procedure, Study
 from sim.study.summary import OBJECTS
+
+_OVERLAY_PX = 900  # width of a run's picture
 
 
 def run_trial(folder: Path, procedure: Procedure, study: Study, plan: Plan, views: int | None = None) -> dict[str, Any]:
@@ -47,16 +51,30 @@ def register_case(
     find: Detector | None = None,
     start: Mapping[str, Tensor] | None = None,
     scene: Scene | None = None,
+    overlay: Path | None = None,
 ) -> tuple[dict[str, Any], Result | None]:
     """Register a case, and tell what is worth keeping, with errors where it has a truth; and the result, if any.
 
-    `find`, `start` and `scene` are as in `femoreg_torch.registration.run.register_scene`.
+    `find`, `start` and `scene` are as in `femoreg_torch.registration.run.register_scene`. A small picture of the images
+    with the edges of what was found is written to `overlay`, if given, as JPEG.
     """
     try:
         result, scene = register_scene(case, scene, plan, seed=seed, find=find, start=start)
     except InputError as error:
         return {"refused": str(error), "trusted": False, "reasons": []}, None
+    if overlay is not None:
+        _write_overlay(overlay, overlay_figure(case, scene, result.poses))
     return plain({"refused": None} | _told(result, scene) | _measured(case, scene, result)), result
+
+
+def _write_overlay(path: Path, picture: Picture) -> None:
+    """Write a picture (H, W, 3) as a small JPEG, whole or not at all."""
+    height = round(picture.shape[0] * _OVERLAY_PX / picture.shape[1])
+    small = cv2.resize(picture, (_OVERLAY_PX, height), interpolation=cv2.INTER_AREA)
+    _, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with temporary_file(path) as part:
+        part.write_bytes(jpeg.tobytes())
 
 
 def first_views(case: Case, views: int | None) -> Case:
@@ -82,10 +100,20 @@ def _measured(case: Case, scene: Scene, result: Result) -> dict[str, Any]:
     at_start = scene.start(result.start.camera1_from_object)
     return {
         "errors": errors(truth, result.poses, points),
+        "pelvis_at_head_mm": _pelvis_at_head(truth, result.poses, points),
         "displacements_mm": path_displacements(truth, result.poses, points),
         "start_errors": {name: row for name, row in errors(truth, at_start, points).items() if name in OBJECTS},
         "asked": _asked(truth, scene),
     }
+
+
+def _pelvis_at_head(truth: Poses, estimate: Poses, points: ReferencePoints) -> float | None:
+    """Displacement in mm of the pelvis at the femoral head, as in the paper's Figure 9; None where one is missing."""
+    if not {PELVIS, FEMUR} <= truth.camera1_from.keys() & estimate.camera1_from.keys():
+        return None
+    head = points.objects[FEMUR][None]
+    there, found = (transform_points(poses.camera1_from[PELVIS], head) for poses in (truth, estimate))
+    return float((found - there).norm())
 
 
 def _asked(truth: Poses, scene: Scene) -> list[str]:

@@ -73,10 +73,14 @@ def settings_of(protocol: Protocol, name: str) -> dict[str, Setting]:
 
 @dataclass(frozen=True)
 class Simulated:
-    """Runs on procedures that are simulated. `keep` is a folder for their cases, which else are not kept."""
+    """Runs on procedures that are simulated, with a picture of each result in `overlays`, but for closed loops.
+
+    `keep` is a folder for their cases, which else are not kept.
+    """
 
     settings: dict[str, Setting]
     stores: Stores
+    overlays: Path
     keep: Path | None = None
 
     def __call__(self, procedure: Procedure, scratch: Path) -> Callable[[Run], Record]:
@@ -94,7 +98,7 @@ class Simulated:
             began = time.perf_counter()
             make_case(condition, procedure, base, body, target)
             simulated = time.perf_counter() - began
-            found, _ = registered(setting, procedure, target)
+            found, _ = registered(setting, procedure, target, overlay=picture_of(run, self.overlays))
             found["timings_s"] = found.get("timings_s", {}) | {"simulation": simulated}
         if self.keep is None:
             shutil.rmtree(target)
@@ -103,20 +107,38 @@ class Simulated:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Runs on cases that are there, by the number of their procedure."""
+    """Runs on cases that are there, by the number of their procedure, with a picture of each result in `overlays`."""
 
     settings: dict[str, Setting]
     cases: dict[int, Path]
+    overlays: Path
 
     def __call__(self, procedure: Procedure, scratch: Path) -> Callable[[Run], Record]:
         folder = self.cases[procedure.number]
-        return lambda run: registered(self.settings[run.condition], procedure, folder)[0]
+
+        def record(run: Run) -> Record:
+            return registered(self.settings[run.condition], procedure, folder, overlay=picture_of(run, self.overlays))[
+                0
+            ]
+
+        return record
+
+
+def picture_of(run: Run, overlays: Path) -> Path:
+    """Where the picture of a run's result is."""
+    return overlays / f"{run.name}.jpg"
 
 
 def registered(
-    setting: Setting, procedure: Procedure, folder: Path, start: Mapping[str, Tensor] | None = None
+    setting: Setting,
+    procedure: Procedure,
+    folder: Path,
+    start: Mapping[str, Tensor] | None = None,
+    overlay: Path | None = None,
 ) -> tuple[Record, Result | None]:
     """Register the case in a folder as a condition says, from `start` poses (4, 4) if there are any.
+
+    A picture of the result is written to `overlay`, if given.
 
     Raises `InputError` if the condition needs the truth of a case that has none.
     """
@@ -132,7 +154,7 @@ def registered(
         generator = torch.Generator().manual_seed(procedure.seed)
         centre = scene.objects[PELVIS].reference_point
         start = {PELVIS: displaced(_true_pelvis(case), centre, variation.start, generator)}
-    return register_case(case, setting.plan, procedure.seed, find, start, scene)
+    return register_case(case, setting.plan, procedure.seed, find, start, scene, overlay)
 
 
 def _true_pelvis(case: Case) -> Tensor:

@@ -77,6 +77,16 @@ def test_one_place_in_two_amounts_is_one_amount(femur: Femur, planning: Planning
     assert np.abs(at_once - in_turn).sum() < 0.02 * at_once.sum()
 
 
+def test_cement_follows_a_place_that_moves_by_less_than_a_block(femur: Femur, planning: Planning) -> None:
+    bone = spongy(femur, np.full((COUNT,) * 3, 0.8))
+    centres = []
+    for x in (0.0, 0.1, 0.5, 1.0, 1.3):
+        cement = diffuse(bone, [Injection(MIDDLE + np.array([x, 0, 0]), 2.0)], settings(planning, voxel_mm=2.0))
+        assert bone.cement_ml(cement) == pytest.approx(2.0, rel=1e-9)
+        centres.append((np.arange(COUNT)[:, None, None] * cement).sum() / cement.sum())
+    np.testing.assert_allclose(np.array(centres) - centres[0], [0, 0.1, 0.5, 1.0, 1.3], atol=0.12)
+
+
 def test_coarser_blocks_give_nearly_the_same_cement(femur: Femur, planning: Planning) -> None:
     bone = spongy(femur, np.full((COUNT,) * 3, 0.8))
     fine, coarse = (diffuse(bone, [Injection(MIDDLE, 6.0)], settings(planning, voxel_mm=h)) for h in (1.0, 2.0))

@@ -61,12 +61,15 @@ def test_the_report_is_one_page_that_loads_nothing(folder: Path) -> None:
     write_rows(rows, folder / "runs.parquet")
     worst = rows.set_index("relative_mm").loc[7.5]
     (folder / "overlays").mkdir()
-    cv2.imwrite(str(folder / "overlays" / f"{run_name(worst)}.png"), np.full((20, 30, 3), 90, np.uint8))
+    cv2.imwrite(str(folder / "overlays" / f"{run_name(worst)}.jpg"), np.full((20, 30, 3), 90, np.uint8))
     assert main(["report", str(folder)]) == 0
     text = (folder / "report.html").read_text(encoding="utf-8")
     page = Page(text)
     assert page.references
-    assert all(reference.startswith("data:image/png;base64,") for reference in page.references)
+    assert all(
+        reference.startswith(("data:image/png;base64,", "data:image/jpeg;base64,")) for reference in page.references
+    )
+    assert sum(reference.startswith("data:image/jpeg") for reference in page.references) == 1  # of the worst run
     assert not re.search(r"https?:|url\(|@import|<script|<link", text)
     assert "default-src 'none'" in text
     assert 'name="viewport"' in text

@@ -1,9 +1,11 @@
 """A run of a study is a case that is simulated, registered and measured; a recorded case is registered just so."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 import yaml
 from coarse import PROCEDURE, SIMULATION, stores_in
@@ -59,7 +61,7 @@ def settings(protocol: Protocol) -> dict[str, Setting]:
 @pytest.fixture(scope="module")
 def records(coarse_root: Path, settings: dict[str, Setting]) -> dict[str, dict[str, Any]]:
     (coarse_root / "scratch").mkdir()
-    work = Simulated(settings, stores_in(coarse_root), coarse_root / "kept")
+    work = Simulated(settings, stores_in(coarse_root), coarse_root / "overlays", coarse_root / "kept")
     make = work(PROCEDURE, coarse_root / "scratch")
     return {name: make(run_of(name)) for name in settings}
 
@@ -82,11 +84,24 @@ def test_a_record_is_that_of_its_condition(records: dict[str, dict[str, Any]]) -
     assert (off["mm"], off["deg"]) == pytest.approx((13, 3), abs=1e-4)  # 12 mm deep and 5 mm aside
 
 
+def test_a_record_comes_with_a_picture_and_the_error_of_the_pelvis_at_the_head(
+    coarse_root: Path, records: dict[str, dict[str, Any]]
+) -> None:
+    picture = cv2.imread(str(coarse_root / "overlays" / f"{run_of('plain').name}.jpg"))
+    assert picture is not None
+    assert picture.shape[1] == 900
+    assert picture.std() > 10
+    pelvis = records["plain"]["errors"]["pelvis"]
+    arm_mm = 200  # the head is nearer to the middle of the pelvis
+    turned = arm_mm * pelvis["deg"] * math.pi / 180
+    assert abs(records["plain"]["pelvis_at_head_mm"] - pelvis["mm"]) < turned
+
+
 def test_cases_are_gone_unless_they_are_kept(
     coarse_root: Path, settings: dict[str, Setting], records: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
     assert (coarse_root / "kept" / run_of("plain").name / "case.yaml").is_file()
-    work = Simulated({"plain": settings["plain"]}, stores_in(coarse_root))
+    work = Simulated({"plain": settings["plain"]}, stores_in(coarse_root), coarse_root / "overlays")
     again = work(PROCEDURE, tmp_path)(run_of("plain"))
     assert {path.name for path in tmp_path.iterdir()} == {"body"}
     for key in ("errors", "start_errors", "poses"):
