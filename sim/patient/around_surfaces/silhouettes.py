@@ -1,5 +1,7 @@
 """Shadows of bone surfaces seen from far away, and what can be read from them."""
 
+import math
+
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _MARGIN_MM = 3.0
-_SAMPLES = 12  # along each side of a triangle: with pixels of 0.5 mm they fill triangles of up to 6 mm
+_EDGE_MM = 6.0  # of the largest triangles: they are sampled so densely that no pixel within is missed
 
 
 def silhouette(points2: Points, faces: NDArray[np.int64], pixel_mm: float) -> tuple[Mask, Points]:
@@ -18,9 +20,10 @@ def silhouette(points2: Points, faces: NDArray[np.int64], pixel_mm: float) -> tu
     origin = points2.min(0) - _MARGIN_MM
     image = np.zeros(np.ceil((points2.max(0) + _MARGIN_MM - origin) / pixel_mm).astype(int), bool)
     a, b, c = (points2[faces[:, k]] for k in range(3))
-    for i in range(_SAMPLES + 1):
-        for j in range(_SAMPLES + 1 - i):
-            sample = (a * i + b * j + c * (_SAMPLES - i - j)) / _SAMPLES
+    samples = math.ceil(_EDGE_MM / pixel_mm)  # along each side
+    for i in range(samples + 1):
+        for j in range(samples + 1 - i):
+            sample = (a * i + b * j + c * (samples - i - j)) / samples
             image[tuple(((sample - origin) / pixel_mm).astype(int).T)] = True
     return ndimage.binary_closing(image, iterations=2), origin
 
