@@ -10,7 +10,7 @@ from nbformat import NotebookNode
 
 from notebooks.execute import FOLDER, execute
 
-NOTEBOOKS = ("one_case_step_by_step", "a_study")
+NOTEBOOKS = ("synthetic_fluoroscopy", "one_case_step_by_step", "a_study")
 # Of a machine's file system: the beginning of a line, a blank, a bracket or a quotation mark stands before it.
 ABSOLUTE_PATH = re.compile(
     r"(?:^|[\s('\"`=])(?:/(?:home|root|tmp|usr|opt|work|Users|private|var|mnt)/|[A-Z]:\\)", re.MULTILINE
