@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test lint bench bench-gpu accuracy capture-range trust ablation
+.PHONY: setup demo test lint notebooks bench bench-gpu accuracy capture-range trust ablation
 
 setup: .venv/.installed
 
@@ -22,6 +22,10 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# executes all notebooks in place, at full size
+notebooks: setup
+	$(BIN)/python notebooks/execute.py
 
 bench: setup
 	$(BIN)/python benchmarks/drr.py
