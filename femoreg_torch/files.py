@@ -1,5 +1,6 @@
-"""Writing files and folders that appear whole or not at all, whatever happens to the run that writes them."""
+"""Files and folders that appear whole or not at all, whatever happens to the run that writes them; JSON and CSV."""
 
+import csv
 import errno
 import fcntl
 import glob
@@ -201,3 +202,15 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{path}: a JSON object {{…}} was expected, found {type(content).__name__}.")
     return content
+
+
+def read_csv(path: Path, columns: Collection[str]) -> list[dict[str, str]]:
+    """The rows of a CSV file by its header, which must hold these columns. Raises `InputError` that names the file."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
+    if not rows or not set(columns) <= set(rows[0]):
+        raise InputError(f"{path}: a header with {', '.join(columns)}, and rows below it, were expected.")
+    return rows

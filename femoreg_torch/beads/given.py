@@ -1,6 +1,5 @@
 """What a user says of beads: a YAML file that names them, and a table of their shadows."""
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from femoreg_torch.beads.model import Beads, check_beads
 from femoreg_torch.case import Case
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.errors import InputError
+from femoreg_torch.files import read_csv
 from femoreg_torch.registration.prepare import read_bones
 from femoreg_torch.volume import read_landmarks
 
@@ -120,13 +120,7 @@ def read_marks(path: Path, names: list[str], case: Case) -> dict[str, tuple[Mark
     `image` is the file name in the case, with or without its suffix; `bead` may be empty. Pixels count from the centre
     of the first one. Raises `InputError` that names file and line.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
-    if not rows or not set(COLUMNS) <= set(rows[0]):
-        raise InputError(f"{path}: a header with {', '.join(COLUMNS)}, and rows below it, were expected.")
+    rows = read_csv(path, COLUMNS)
     images = {image.name: image.name for view in case.views for image in view.images.values()}
     images |= {Path(name).stem: name for name in images}
     rows_px, columns_px = case.carm.camera.shape

@@ -1,6 +1,5 @@
 """Files that start a registration by hand: landmarks in the first image, and start poses."""
 
-import csv
 from pathlib import Path
 
 import torch
@@ -8,7 +7,7 @@ from torch import Tensor
 
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import read_json
+from femoreg_torch.files import read_csv, read_json
 from femoreg_torch.volume import read_landmarks
 
 COLUMNS = ("landmark", "column_px", "row_px")
@@ -27,13 +26,7 @@ def read_pixels(path: Path) -> dict[str, Tensor]:
         raise InputError(f"{path}: no such file.")
     if path.suffix.lower() != ".csv":
         return {name: point[:2] for name, point in read_landmarks(path, None).items()}
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
-    if not rows or not set(COLUMNS) <= set(rows[0]):
-        raise InputError(f"{path}: a header with {', '.join(COLUMNS)}, and rows below it, were expected.")
+    rows = read_csv(path, COLUMNS)
     if len(images := {row.get("image") for row in rows}) > 1:
         raise InputError(f"{path}: holds landmarks of {len(images)} images. Keep the rows of the first view.")
     found: dict[str, Tensor] = {}
