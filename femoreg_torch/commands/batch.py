@@ -165,13 +165,12 @@ def run_jobs(waiting: Sequence[Job], count: int, run: Callable[[Job], Row] | Non
 def run_job(job: Job) -> Row:
     """Register one case in this process; what goes wrong becomes a row."""
     import time
-    import traceback
 
     import numba
     import torch
 
     from femoreg_torch.commands.register import register_into
-    from femoreg_torch.errors import InputError
+    from femoreg_torch.errors import InputError, defect_in_one_line
 
     torch.set_num_threads(job.threads)
     numba.set_num_threads(job.threads)  # or its kernels take all cores, and torch's next ones with them
@@ -181,9 +180,7 @@ def run_job(job: Job) -> Row:
     except (InputError, OSError) as error:
         return _bad(job, "refused", " ".join(str(error).split()), time.perf_counter() - began)
     except Exception as error:  # a defect: told with its place, and the other cases go on
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        told = f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno})"
-        return _bad(job, "failed", " ".join(told.split()), time.perf_counter() - began)
+        return _bad(job, "failed", defect_in_one_line(error), time.perf_counter() - began)
     return _row(job, "done", result)
 
 

@@ -9,7 +9,6 @@ import os
 import platform
 import shutil
 import time
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any, Protocol
 import numba
 import torch
 
+from femoreg_torch.errors import defect_in_one_line
 from femoreg_torch.registration.run import versions
 from sim.study.procedures import Procedure
 from sim.study.store import FAILED, Batch, Run, Store
@@ -89,7 +89,7 @@ def _attempt(make: Callable[[Run], Record], run: Run, folder: Path) -> Record:
             raise
         if shutil.disk_usage(folder).free < _ROOM_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder)) from error
-        found = _failed(_told(error))
+        found = _failed(defect_in_one_line(error))
     else:
         found = found | outcome(found)
     return _about(run) | found | {"run_s": time.perf_counter() - began}
@@ -107,10 +107,3 @@ def _about(run: Run) -> Record:
 
 def _failed(reason: str) -> dict[str, Any]:
     return {"status": FAILED, "reason": reason, "refused": reason, "trusted": False, "reasons": []}
-
-
-def _told(error: Exception) -> str:
-    """A defect in one line, with its place."""
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    told = f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno})"
-    return " ".join(told.split())
