@@ -30,11 +30,11 @@ def skeleton() -> Skeleton:
 
 @pytest.fixture(scope="module")
 def surfaces(skeleton: Skeleton) -> dict[str, trimesh.Trimesh]:
-    """The bones' surfaces as triangles of about 1.5 mm."""
+    """The bones' surfaces as triangles of about 3 mm."""
     meshes = {}
     for bone in BONES:
         field = skeleton.bones[bone]
-        vertices, faces, _, _ = marching_cubes(np.pad(field.values, 1, constant_values=9.0), 0.0)
+        vertices, faces, _, _ = marching_cubes(np.pad(field.values, 1, constant_values=9.0), 0.0, step_size=2)
         meshes[bone] = trimesh.Trimesh((vertices - 1) * field.step + field.lo, faces)
         meshes[bone].fix_normals()
     return meshes
