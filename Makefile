@@ -15,8 +15,9 @@ setup: .venv/.installed
 demo: setup
 	$(BIN)/femoreg demo --out out/demo
 
+# several processes, each with its share of the cores; the tests of one file run in one of them
 test: setup
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 lint: setup
 	$(BIN)/ruff check .

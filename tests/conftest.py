@@ -5,6 +5,12 @@ from pathlib import Path
 
 import pytest
 
+# Several processes of tests share the machine's cores. Libraries read these when they are first imported, so they stand here.
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
+    _threads = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
+    for _library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
+        os.environ.setdefault(f"{_library}_NUM_THREADS", str(_threads))
+
 
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
