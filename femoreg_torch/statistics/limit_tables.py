@@ -19,7 +19,8 @@ from femoreg_torch.statistics.quantities import BY_COLUMN, POSES, QUANTITIES, Qu
 
 BOUNDS_NAME = "bounds.parquet"
 BOUND, NOISE, INFORMATION, REGISTERED = "bound", "noise", "information", "registered"
-ALL_IMAGES, USUAL = "all", "and densities"  # of the bones, and of every part of the device
+ALL_IMAGES = "all"
+POSES_ALONE, USUAL = "poses", "+ densities"  # unknown; the latter of bones and device parts, light and tissue too
 _WORTH = tuple(BY_COLUMN[f"{key}_mm"] for key in (*POSES, "entry_point", "tip", "relative"))
 _NEEDED = ("condition", "number", "what", "unknown", "images")
 
@@ -78,8 +79,8 @@ def limit_table(rows: pd.DataFrame, bounds: pd.DataFrame) -> Table:
                     | {f"bound {kind}": value for kind, value in found.items()} | {"ratio": ratio})  # fmt: skip
     note = (
         f"Root mean squares over {len(same)} procedures. Bounds: the least that the noise of photons and electronics "
-        "allows, with more and more unknown beside the poses. Ratio: error by the bound of "
-        f"`{USUAL}`. Noise alone: the last stage on images that show what it draws, with photon noise, of "
+        f"allows, with more and more unknown beside the poses. Ratio: error by the bound `{USUAL}`. Noise "
+        "alone: the last stage on images that show what it draws, with photon noise, of "
         f"{noisy['number'].nunique()} procedures; – where none was registered."
     )
     columns = ("", "error", "noise alone", *(f"bound, {kind}" for kind in kinds), "ratio")
@@ -103,8 +104,8 @@ def worth_table(bounds: pd.DataFrame) -> Table:
         lines.append((images, *cells))
         data.append({"images": images} | found)
     note = (
-        f"Bounds (root mean square over {usual['number'].nunique()} procedures, {USUAL} unknown) with all images, and "
-        "by what factor they grow with fewer. ∞: these images do not fix it; –: there is no such view."
+        f"Bounds (root mean square over {usual['number'].nunique()} procedures; unknown are poses {USUAL}) with all "
+        "images, and by what factor they grow with fewer. ∞: these images do not fix it; –: there is no such view."
     )
     columns = ("images", *(q.name for q in shown))
     return Table("worth", "What each image is worth", note, columns, tuple(lines), pd.DataFrame(data))

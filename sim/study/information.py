@@ -7,6 +7,7 @@ independent, so their informations add up. Unknowns that nobody asks for (how mu
 like the others: to invert the whole F is to find them from the same images.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -49,13 +50,16 @@ class Bound:
     parts: tuple[Information, ...]
     basis: Tensor  # (n, m): directions in the unknowns
     variances: Tensor  # (m,): along them; infinite where nothing informs
+    unseen: frozenset[str] = frozenset()  # unknown blocks that no part is about
 
     def deviation(self, response: Response) -> float:
         """Least root mean square length of r numbers that respond to the unknowns; infinite if images leave it open."""
+        if any(rows.any() for block, rows in response.items() if block in self.unseen):
+            return math.inf
         return float((self._answers(response)[0] ** 2).sum().sqrt())
 
     def shares_of_noise(self, response: Response) -> dict[str, float]:
-        """Shares of the squared deviation that the noise of each part brings; they sum to 1.
+        """Shares of the squared deviation, which has to be finite, that the noise of each part brings; they sum to 1.
 
         The best estimate is F⁻¹ Σ sᵢ, of scores with covariances Fᵢ, so its covariance is Σ F⁻¹ Fᵢ F⁻¹.
         """
@@ -92,7 +96,7 @@ def bound(parts: Sequence[Information], unknown: Sequence[str]) -> Bound:
     scale = torch.where(whole.diagonal() > 0, whole.diagonal(), torch.ones_like(whole.diagonal())).rsqrt()
     values, vectors = torch.linalg.eigh(scale[:, None] * whole * scale)
     variances = torch.where(values > _NULL, 1 / values.clamp_min(_NULL), torch.inf)
-    return Bound(widths, kept, scale[:, None] * vectors, variances)
+    return Bound(widths, kept, scale[:, None] * vectors, variances, frozenset(unknown) - widths.keys())
 
 
 def shares_of_information(parts: Sequence[Information], block: str) -> dict[str, float]:

@@ -29,6 +29,7 @@ from femoreg_torch.statistics.limit_tables import (
     BOUNDS_NAME,
     INFORMATION,
     NOISE,
+    POSES_ALONE,
     REGISTERED,
     USUAL,
     first_views_name,
@@ -65,13 +66,13 @@ Row = dict[str, Any]
 # What is unknown beside the poses: kinds of blocks.
 _LIGHT = ("exposure", "scatter", "tissue")
 _UNKNOWN: dict[str, tuple[str, ...]] = {
-    "poses alone": (),
-    "and light and tissue": _LIGHT,
+    POSES_ALONE: (),
+    "+ light and tissue": _LIGHT,
     USUAL: (*_LIGHT, "density"),
-    "and shape of the tissue": (*_LIGHT, "density", "shape"),
-    "and cameras": (*_LIGHT, "density", "camera"),
+    "+ densities and tissue's shape": (*_LIGHT, "density", "shape"),
+    "+ densities and cameras": (*_LIGHT, "density", "camera"),
 }
-_CARM_KNOWN = "but the C-arm's poses known"
+_CARM_KNOWN = "+ densities, C-arm known"
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +218,7 @@ def bound_rows(imagined: Imagined) -> Iterator[Row]:
         of_noise = {column: shares[image.name] for column, shares in noise.items()}
         yield {"what": NOISE, "unknown": USUAL, "images": image.name} | of_noise
         of_objects = {f"{block}_mm": shares[image.name] for block, shares in about.items()}
-        yield {"what": INFORMATION, "unknown": "poses alone", "images": image.name} | of_objects
+        yield {"what": INFORMATION, "unknown": POSES_ALONE, "images": image.name} | of_objects
 
 
 def _blocks(there: set[str], poses: Poses, kinds: Sequence[str]) -> list[str]:

@@ -15,12 +15,13 @@ from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, RigidObject, Scene, moved
-from femoreg_torch.similarity import GradNcc
+from femoreg_torch.similarity import Ncc
 from femoreg_torch.statistics.quantities import QUANTITIES
 from femoreg_torch.volume import Volume, axis_aligned
 from sim.study.exposures import Drawn, drawn_images, with_noise
 from sim.study.information import Bound, bound, image_information, known_before, shares_of_information
 from sim.study.responses import centres_in, error_responses
+from sim.study.summary import flat_errors
 
 CARM = CArm(centred_camera(1000.0, (3.2, 3.2), (96, 96)), (0.0, 0.0, 640.0), (0.0, 1.0, 0.0))
 POSES = ("pelvis", "femur", "device", "view2", "view3")
@@ -113,7 +114,7 @@ def test_a_blob_is_known_as_well_as_its_closed_form_says() -> None:
     assert across == pytest.approx(math.sqrt(v) * q / (math.pi * a * s), rel=0.02)  # voxels of s / 5 blur it
     assert depth == pytest.approx(math.sqrt(v) * q * z / (2 * math.pi * a * s**2), rel=0.03)
     turn = found.deviation({"blob": torch.eye(6)[:1]})
-    assert turn > 100 * depth / s  # a ball looks the same however it is turned
+    assert turn > 20 * across / s  # a ball looks the same however it is turned
 
 
 def test_what_no_image_tells_is_open_and_the_rest_is_not() -> None:
@@ -194,7 +195,7 @@ def twisted(poses: Poses, points: ReferencePoints, block: str, twist: Tensor) ->
 @pytest.mark.parametrize("block", POSES)
 def test_responses_are_what_the_evaluation_tells(poses: Poses, points: ReferencePoints, block: str) -> None:
     generator = torch.Generator().manual_seed(5)
-    twist = 1e-5 * torch.randn(6, generator=generator, dtype=torch.float64) * at(1, 1, 1, 50, 50, 50)
+    twist = 1e-4 * torch.randn(6, generator=generator, dtype=torch.float64) * at(1, 1, 1, 50, 50, 50)
     there = twisted(poses, points, block, twist)
     found = errors(poses, there, points)
     moves = path_displacements(poses, there, points)
@@ -205,10 +206,10 @@ def test_responses_are_what_the_evaluation_tells(poses: Poses, points: Reference
         if end in ("is", "lr", "ap"):
             row, unit = key.rsplit("_", 1)
             expected = found[row][f"{unit}_xyz"][("is", "lr", "ap").index(end)]
-            assert float(change) == pytest.approx(expected, rel=1e-3, abs=1e-8), column
+            assert float(change) == pytest.approx(expected, rel=5e-3, abs=2e-5), column
         else:
             expected = found[column] if column in found else found[key][end]
-            assert float(change.norm()) == pytest.approx(expected, rel=1e-3, abs=1e-8), column
+            assert float(change.norm()) == pytest.approx(expected, rel=5e-3, abs=2e-5), column
 
 
 @pytest.mark.parametrize("block", [*POSES, "source distance", "principal point 2"])
@@ -237,53 +238,49 @@ def test_changes_of_the_images_are_those_of_images_drawn_anew(
         step = torch.zeros(len(steps), dtype=torch.float64)
         step[n] = size
         expected = (photons(step) - photons(-step)) / (2 * size)
-        assert (changes[n] - expected).abs().max() < 0.03 * expected.abs().max() + 1e-3 * PHOTONS / 100
+        assert (changes[n] - expected).abs().max() < 0.05 * expected.abs().max()
     if block == "view3":
         other = next(image for image in drawn if image.view == 1)
         assert block not in other.changes
 
 
-def test_estimates_from_noisy_images_reach_the_bound_and_grad_ncc_comes_near(
+def test_estimates_from_noisy_images_reach_the_bound(
     scene: Scene, poses: Poses, points: ReferencePoints, drawn: list[Drawn]
 ) -> None:
-    """One step of maximum likelihood from the truth is as good as the bound; patch Grad-NCC is worse, but not by much.
+    """One step of maximum likelihood from the truth is as good as the bound; the library's NCC comes near to it.
 
-    Over 20 draws and 30 unknowns the mean squared ratio is known to some 1/√300 for the former.
+    Over 20 draws and 30 unknowns the mean squared ratio is known to some 1/√300 for the former; NCC weighs all pixels
+    alike and finds a contrast and an offset of every image besides. Four of its draws know a ratio to a fifth.
     """
-    parts = [image.information for image in drawn]
-    found = bound(parts, POSES)
+    found = bound([image.information for image in drawn], POSES)
     responses = error_responses(poses, points)
     inverse = found.basis * found.variances @ found.basis.T
     places = dict(zip(found.widths, range(0, 30, 6), strict=True))
     generator = torch.Generator().manual_seed(1)
-    squares = {"likelihood": torch.zeros(len(TOTALS)), "patches": torch.zeros(len(TOTALS))}
+    likelihood, correlation = torch.zeros(len(TOTALS)), torch.zeros(len(TOTALS))
     draws, fewer, chi = 20, 4, 0.0
     for number in range(draws):
         noisy = with_noise(scene, drawn, PHOTONS, generator)
         score = torch.zeros(30, dtype=torch.float64)
         for image in drawn:
-            seen = noisy.images[image.kind][image.view]
-            assert seen is not None
-            push = ((PHOTONS * torch.exp(-seen) - image.expected) / image.expected).double()
+            push = (PHOTONS * torch.exp(-noisy.image(image.kind, image.view)) / image.expected - 1).double()
             for block, start in places.items():
                 if block in image.changes:
                     score[start : start + 6] += (image.changes[block].double() * push).sum((1, 2))
         step = inverse @ score
         chi += float(step @ score) / (30 * draws)
         moves = {block: step[start : start + 6] for block, start in places.items()}
-        squares["likelihood"] += lengths(responses, moves) ** 2 / draws
+        likelihood += lengths(responses, moves) ** 2 / draws
         if number < fewer:
-            estimate = registered(noisy, poses, points)
-            flat = errors(poses, estimate, points)
-            lines = [flat[c] if c in flat else flat[c.rsplit("_", 1)[0]][c.rsplit("_", 1)[1]] for c in TOTALS]
-            squares["patches"] += torch.tensor(lines) ** 2 / fewer
+            told_by = flat_errors(errors(poses, registered(noisy, poses, points), points))
+            correlation += torch.tensor([told_by[column] for column in TOTALS]) ** 2 / fewer
     least = told(found, poses, points)
     assert chi == pytest.approx(1, abs=0.2)  # four deviations
-    ratio = squares["likelihood"].sqrt() / least
+    ratio = likelihood.sqrt() / least
     assert float(ratio.log().mean().exp()) == pytest.approx(1, abs=0.15)
     assert ((ratio > 0.6) & (ratio < 1.5)).all()
-    ratio = squares["patches"].sqrt() / least
-    assert 1 < float(ratio.log().mean().exp()) < 4, ratio
+    ratio = correlation.sqrt() / least
+    assert 0.9 < float(ratio.log().mean().exp()) < 2, ratio
 
 
 def lengths(responses: dict[str, dict[str, Tensor]], moves: dict[str, Tensor]) -> Tensor:
@@ -294,14 +291,14 @@ def lengths(responses: dict[str, dict[str, Tensor]], moves: dict[str, Tensor]) -
 
 
 def registered(scene: Scene, poses: Poses, points: ReferencePoints) -> Poses:
-    """Everything refined together from the truth, as the last stage does."""
+    """Everything refined together from the truth, by the library's NCC of whole images."""
     scale = at(0.01, 0.01, 0.01, 0.5, 0.5, 2)
     bodies = [Body((name,), 0, centre, scale) for name, centre in centres_in(poses, points, 0).items()]
     bodies += [Body((), view, centres_in(poses, points, view)["pelvis"], scale) for view in (1, 2)]
     images = scene.there(scene.images, range(3))
     level = Level(pixel_mm=3.2, step_mm=STEP_MM)
-    costs = image_costs(scene, poses, tuple(bodies), tuple(scene.objects), images, level, GradNcc(patch_radius=4))
-    result = LevenbergMarquardt(max_iterations=4, tol_x=1e-4, tol_f=1e-9).minimise(
+    costs = image_costs(scene, poses, tuple(bodies), tuple(scene.objects), images, level, Ncc())
+    result = LevenbergMarquardt(max_iterations=3, tol_x=1e-4, tol_f=1e-9).minimise(
         stage_objective(costs, tuple(bodies), None), 30, seed=0
     )
     return moved(poses, tuple(bodies), result.delta)
