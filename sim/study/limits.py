@@ -53,6 +53,7 @@ from sim.study.information import Information, bound, known_before, shares_of_in
 from sim.study.procedures import Procedure
 from sim.study.protocol import Protocol, load_protocol
 from sim.study.responses import error_responses, view_block
+from sim.study.rows import read_table
 from sim.study.summary import flat_errors
 from sim.study.work import Setting, settings_of
 from sim.theatre.images import posed_tissue
@@ -62,6 +63,7 @@ from sim.theatre.procedure import draw_procedure
 from sim.theatre.settings import Simulation
 
 Row = dict[str, Any]
+PROCEDURAL = "procedural"  # kind of runs on computed patients
 
 # What is unknown beside the poses: kinds of blocks.
 _LIGHT = ("exposure", "scatter", "tissue")
@@ -97,8 +99,8 @@ def limits(
 
     `protocol_name` is the protocol that the study was made by; `condition` one of its conditions, by default the first.
     Images are seen on pixels of about `pixel_mm`. On the first `noisy` of them, images with nothing but the noise of
-    photons are registered as well. Procedures that are in the file already are not made again. Raises `InputError`
-    where study and protocol do not fit.
+    photons are registered as well. Procedures that are in the file already are not made again; patients around real
+    bones are passed over. Raises `InputError` where study and protocol do not fit.
     """
     protocol = load_protocol(protocol_name)
     settings = settings_of(protocol, Path(protocol_name).stem)
@@ -106,11 +108,11 @@ def limits(
     if name not in settings:
         raise InputError(f"--condition {name}: the protocol has no such condition; it has: {', '.join(settings)}.")
     runs = read_study(study)
-    runs = runs[runs["condition"].eq(name) & runs["status"].eq(DONE)].head(count)
+    runs = runs[runs["condition"].eq(name) & runs["status"].eq(DONE) & runs["kind"].eq(PROCEDURAL)].head(count)
     if runs.empty:
-        raise InputError(f"{study}: holds no finished run of the condition {name!r}.")
+        raise InputError(f"{study}: holds no finished run of the condition {name!r} on a procedural patient.")
     path = study / BOUNDS_NAME
-    rows = pd.read_parquet(path).to_dict("records") if path.is_file() else []
+    rows: list[Row] = read_table(path).to_pylist() if path.is_file() else []
     for place, (_, run) in enumerate(runs.iterrows()):
         procedure = _procedure(protocol, run, study)
         there = {row["what"] for row in rows if (row["condition"], row["number"]) == (name, procedure.number)}
@@ -132,7 +134,7 @@ def _procedure(protocol: Protocol, run: "pd.Series[Any]", study: Path) -> Proced
     if (found.patient, found.side, found.seed) != (run["patient"], run["side"], int(run["seed"])):
         raise InputError(
             f"{study}: procedure {found.number} is patient {run['patient']}, {run['side']}, seed {run['seed']}, which "
-            "the protocol does not draw. Give the study's own protocol; patients around real bones are not made anew."
+            "the protocol does not draw. Give the study's own protocol."
         )
     return found
 
