@@ -1,10 +1,10 @@
 """How far errors are from what images allow: Cramér–Rao bounds beside them, and what each image is worth.
 
-`bounds.parquet` holds a row for each bound of a procedure, written by `python -m sim.study limits`: its `condition` and
-`number`; in `what` a `BOUND` (least root mean square of each error), the share of each image in the squared bound
-(`NOISE`) or in what is known of each pose (`INFORMATION`), or the errors of a registration of images with nothing but
-photon noise (`REGISTERED`); `unknown`, what else had to be found from the images; `images`, those that there were; and
-the columns of the errors.
+`bounds.parquet` holds a row for each bound of a procedure, written by `python -m sim.study limits`: its `condition`,
+`number` and `settings`; in `what` a `BOUND` (least root mean square of each error), the share of each image in the
+squared bound (`NOISE`) or in what is known of each pose (`INFORMATION`), or the errors of a registration of images with
+nothing but photon noise (`REGISTERED`); `unknown`, what else had to be found from the images; `images`, those that
+there were; and the columns of the errors.
 """
 
 from pathlib import Path
@@ -22,7 +22,8 @@ BOUND, NOISE, INFORMATION, REGISTERED = "bound", "noise", "information", "regist
 ALL_IMAGES = "all"
 POSES_ALONE, USUAL = "poses", "+ densities"  # unknown; the latter of bones and device parts, light and tissue too
 _WORTH = tuple(BY_COLUMN[f"{key}_mm"] for key in (*POSES, "entry_point", "tip", "relative"))
-_NEEDED = ("condition", "number", "what", "unknown", "images")
+_OF_RUN = ("condition", "number", "settings")
+_NEEDED = (*_OF_RUN, "what", "unknown", "images")
 
 
 def without_name(image: str) -> str:
@@ -51,7 +52,7 @@ def read_bounds(folder: Path) -> pd.DataFrame | None:
 
 def limit_tables(rows: pd.DataFrame, bounds: pd.DataFrame) -> list[Table]:
     """Of the runs of one condition: errors beside their bounds, and what images are worth."""
-    own = bounds[bounds["condition"].isin(rows["condition"]) & bounds["number"].isin(rows["number"])]
+    own = bounds.merge(rows[list(_OF_RUN)].drop_duplicates(), on=list(_OF_RUN))  # those of other settings do not fit
     if own.empty or rows["condition"].nunique() > 1:
         return []
     return [limit_table(rows, own), worth_table(own), share_table(own)]

@@ -64,6 +64,7 @@ from sim.theatre.settings import Simulation
 
 Row = dict[str, Any]
 PROCEDURAL = "procedural"  # kind of runs on computed patients
+_SAME = ("study", "condition", "number", "settings")  # columns of a run that its bounds depend on
 
 # What is unknown beside the poses: kinds of blocks.
 _LIGHT = ("exposure", "scatter", "tissue")
@@ -115,13 +116,13 @@ def limits(
     rows: list[Row] = read_table(path).to_pylist() if path.is_file() else []
     for place, (_, run) in enumerate(runs.iterrows()):
         procedure = _procedure(protocol, run, study)
-        there = {row["what"] for row in rows if (row["condition"], row["number"]) == (name, procedure.number)}
+        head = {key: run[key] for key in (*_SAME, "patient", "side", "seed")} | {"pixel_mm": pixel_mm}
+        there = {row["what"] for row in rows if all(row.get(key) == head[key] for key in (*_SAME, "pixel_mm"))}
         register = place < noisy
         if BOUND in there and (REGISTERED in there or not register):
             continue
         report(f"procedure {procedure.number}")
         rows = [row for row in rows if (row["condition"], row["number"]) != (name, procedure.number)]
-        head = {key: run[key] for key in ("study", "condition", "number", "patient", "side", "seed")}
         rows += [head | row for row in procedure_rows(settings[name], procedure, pixel_mm, register)]
         with temporary_file(path) as part:
             pd.DataFrame(rows).to_parquet(part, index=False)

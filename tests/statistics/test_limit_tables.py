@@ -25,12 +25,14 @@ from femoreg_torch.statistics.limit_tables import (
 from femoreg_torch.statistics.quantities import POSES, QUANTITIES
 from femoreg_torch.statistics.study import study_tables
 
+SETTINGS = made_up(1)["settings"].iloc[0]
+
 
 def made_up_bounds(condition: str = "plain") -> pd.DataFrame:
     """Of procedures 1 and 2, the errors of which are some mm: all bounds 0.01 and 0.07, twice as much without one."""
     rows = []
     for number, value in ((1, 0.01), (2, 0.07)):
-        head = {"condition": condition, "number": number}
+        head = {"condition": condition, "number": number, "settings": SETTINGS}
         for unknown, factor in ((POSES_ALONE, 0.5), (USUAL, 1.0)):
             every = {q.column: factor * value for q in QUANTITIES}
             rows.append(head | {"what": BOUND, "unknown": unknown, "images": ALL_IMAGES} | every)
@@ -48,8 +50,8 @@ def test_the_ratio_is_that_of_root_mean_squares_over_the_same_procedures() -> No
     rows["number"] = [1, 2, 3]
     rows["relative_mm"] = [0.3, 0.4, 90.0]  # the third has no bound
     bounds = made_up_bounds()
-    bounds.loc[len(bounds)] = {"condition": "plain", "number": 1, "what": REGISTERED, "unknown": USUAL,
-                               "images": ALL_IMAGES, "relative_mm": -0.06}  # fmt: skip
+    place = {"condition": "plain", "number": 1, "settings": SETTINGS, "unknown": USUAL, "images": ALL_IMAGES}
+    bounds.loc[len(bounds)] = place | {"what": REGISTERED, "relative_mm": -0.06}
     limit, worth, shares = limit_tables(rows, bounds)
     line = next(row for row in limit.rows if row[0] == "entry point to tip, mm")
     # √((0.09 + 0.16) / 2), then √((0.0001 + 0.0049) / 2) = 0.05 and half of it
@@ -64,6 +66,7 @@ def test_bounds_of_another_condition_say_nothing() -> None:
     rows = made_up(3)
     rows["number"] = [1, 2, 3]
     assert limit_tables(rows, made_up_bounds("other")) == []
+    assert limit_tables(rows.assign(settings="others"), made_up_bounds()) == []
     two = pd.concat([rows, made_up(3, condition="other").assign(number=[1, 2, 3])], ignore_index=True)
     tables = study_tables(two, 0, made_up_bounds("other"))
     names = {group: {table.name for table in own} for group, own in tables.items()}
@@ -86,5 +89,5 @@ def test_a_file_that_holds_no_bounds_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read as Parquet"):
         read_bounds(tmp_path)
     pd.DataFrame({"number": [1]}).to_parquet(tmp_path / BOUNDS_NAME)
-    with pytest.raises(InputError, match="has no column condition, what"):
+    with pytest.raises(InputError, match="has no column condition, settings"):
         read_bounds(tmp_path)
