@@ -37,12 +37,13 @@ def error_responses(poses: Poses, points: ReferencePoints) -> dict[str, dict[str
     """
     here = centres_in(poses, points, 0)
     found: dict[str, dict[str, Tensor]] = {}
-    for name, centre in here.items():
-        found |= _of_pose(name, name, _moves(here[name] - centre), _turns(torch.eye(3, dtype=torch.float64)))
+    middle, axes = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
+    for name in here:
+        found |= _of_pose(name, name, _moves(middle), _turns(axes))
     anchor = next(iter(poses.camera1_from))
     for view in range(1, len(poses.camera_from_camera1)):
         back = -poses.camera_from_camera1[view, :3, :3].T  # the camera moves against what it sees
-        shift, turn = back @ _moves(-centres_in(poses, points, view)[anchor]), back @ _turns(torch.eye(3).double())
+        shift, turn = back @ _moves(-centres_in(poses, points, view)[anchor]), back @ _turns(axes)
         found |= _of_pose(view_block(view), view_block(view), shift, turn)
     return found | _of_path(poses, points, here)
 
