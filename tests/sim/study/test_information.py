@@ -238,7 +238,7 @@ def test_changes_of_the_images_are_those_of_images_drawn_anew(
         step = torch.zeros(len(steps), dtype=torch.float64)
         step[n] = size
         expected = (photons(step) - photons(-step)) / (2 * size)
-        assert (changes[n] - expected).abs().max() < 0.05 * expected.abs().max()
+        assert (changes[n] - expected).abs().max() < 0.1 * expected.abs().max()
     if block == "view3":
         other = next(image for image in drawn if image.view == 1)
         assert block not in other.changes

@@ -95,7 +95,7 @@ def test_changes_by_the_device_are_those_of_photons_expected_anew(
         step[place] = size
         expected = (photons(step) - photons(-step)) / (2 * size)
         found = drawn["device", 0].changes[DEVICE][place]
-        assert float((found - expected).norm() / expected.norm()) < 0.1  # edges are sharp beside pixels of 3 mm
+        assert float((found - expected).norm() / expected.norm()) < 0.15  # edges are sharp beside pixels of 3 mm
 
 
 def test_the_rows_of_a_procedure_keep_the_order_that_they_must(imagined: Imagined) -> None:
