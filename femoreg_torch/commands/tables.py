@@ -8,7 +8,8 @@ def tables(study: Path, *, beside: Path | None = None, seed: int = 0) -> None:
 
     The paper's Tables I and II beside its values, errors with intervals, success, trust, coverage of the stated
     deviations, what errors depend on and where they come from: for all runs, and for each condition in a folder of its
-    own. Where STUDY holds trials.parquet, the paper's Table III of its trials. What STUDY/tables held is replaced.
+    own. Where STUDY holds trials.parquet, the paper's Table III of its trials; where it holds bounds.parquet, how far
+    errors are from what images allow. What STUDY/tables held is replaced.
 
     Args:
         study: Folder with the runs of a study, runs.parquet.
@@ -18,6 +19,7 @@ def tables(study: Path, *, beside: Path | None = None, seed: int = 0) -> None:
     from rich.console import Console
 
     from femoreg_torch.statistics.formats import for_terminal
+    from femoreg_torch.statistics.limit_tables import read_bounds
     from femoreg_torch.statistics.rows import ROWS_NAME
     from femoreg_torch.statistics.study import (
         TABLES,
@@ -31,7 +33,7 @@ def tables(study: Path, *, beside: Path | None = None, seed: int = 0) -> None:
     of_trials = trials(study)
     found = {}
     if (study / ROWS_NAME).is_file() or not of_trials:
-        found = study_tables(read_study(study), seed)
+        found = study_tables(read_study(study), seed, read_bounds(study))
     common = [*found.get("", ()), *of_trials, *([] if beside is None else compared(study, beside, seed))]
     write_study_tables(study, found | {"": common})
     console = Console()

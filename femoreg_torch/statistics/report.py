@@ -10,6 +10,7 @@ import pandas as pd
 from femoreg_torch.files import write_text
 from femoreg_torch.statistics.figures import Picture
 from femoreg_torch.statistics.formats import Table, html, number, percent
+from femoreg_torch.statistics.limit_tables import read_bounds
 from femoreg_torch.statistics.outcome import WRONG_MM, run_is_wrong, told
 from femoreg_torch.statistics.page import cards, folded, image, listing, page
 from femoreg_torch.statistics.quantities import BY_COLUMN, RELATIVE, Quantity
@@ -54,7 +55,7 @@ def write_report(folder: Path, seed: int, report: Progress) -> None:
     """
     rows = read_study(folder)
     report("tables", 0.0)
-    tables = study_tables(rows, seed)
+    tables = study_tables(rows, seed, read_bounds(folder))
     of_trials = trials(folder)
     write_study_tables(folder, {**tables, "": [*tables[""], *of_trials]})
     pictures = write_study_figures(rows, folder, report)

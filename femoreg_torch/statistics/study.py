@@ -10,6 +10,7 @@ from femoreg_torch.files import new_folder
 from femoreg_torch.statistics.beside import beside_tables
 from femoreg_torch.statistics.figures import Picture, all_figures, paper_figures, write_figures
 from femoreg_torch.statistics.formats import Table, write_tables
+from femoreg_torch.statistics.limit_tables import limit_tables, read_bounds
 from femoreg_torch.statistics.rows import ROWS_NAME, TRIALS_NAME, folder_name, groups, read_rows
 from femoreg_torch.statistics.tables import group_tables, overview_table
 from femoreg_torch.statistics.trials import trial_table
@@ -23,9 +24,12 @@ def read_study(folder: Path) -> pd.DataFrame:
     return read_rows(folder / ROWS_NAME)
 
 
-def study_tables(rows: pd.DataFrame, seed: int) -> dict[str, list[Table]]:
-    """The tables of every group of runs by its name; the overview stands under no name."""
-    return {"": [overview_table(rows)]} | {name: group_tables(part, seed) for name, part in groups(rows).items()}
+def study_tables(rows: pd.DataFrame, seed: int, bounds: pd.DataFrame | None = None) -> dict[str, list[Table]]:
+    """The tables of every group of runs by its name, the overview under none; `bounds` as `read_bounds` has them."""
+    found = {"": [overview_table(rows)]}
+    for name, part in groups(rows).items():
+        found[name] = group_tables(part, seed) + ([] if bounds is None else limit_tables(part, bounds))
+    return found
 
 
 def trials(folder: Path) -> list[Table]:
@@ -55,12 +59,12 @@ def write_study_figures(rows: pd.DataFrame, folder: Path, report: Progress) -> d
 
     What was there goes. Returns them by group.
     """
-    parts = groups(rows)
+    parts, bounds = groups(rows), read_bounds(folder)
     pictures: dict[str, list[Picture]] = {}
     with new_folder(folder / FIGURES, without=_entries(folder / FIGURES)) as out:
         for place, (name, part) in enumerate(parts.items()):
             report(f"figures of {name}", place / len(parts))
-            plots = paper_figures(part) if pictures else all_figures(part)
+            plots = (paper_figures if pictures else all_figures)(part, bounds)
             pictures[name] = write_figures(plots, _subfolder(out, name))
     return pictures
 

@@ -17,6 +17,7 @@ from sim.study import capture
 from sim.study.cases import Stores, ready
 from sim.study.conditions import Imaged, make_conditions, read_conditions
 from sim.study.conditions_page import write_conditions
+from sim.study.limits import limits as limits_of
 from sim.study.procedures import Procedure, Study, load_study, procedures
 from sim.study.timing import time_register
 from sim.study.trust import sabotaged_runs, write_trust
@@ -226,6 +227,32 @@ def conditions(
     print(write_conditions(runs, preset, first, command, folder, docs))
 
 
+def limits(
+    study: Path,
+    protocol: str = "paper",
+    condition: str | None = None,
+    first: int = 6,
+    noise_alone: int = 0,
+    pixel_mm: float = 0.78,
+) -> None:
+    """Tell how far a study's errors are from what its images allow: Cramér–Rao bounds, and what each image is worth.
+
+    Procedures are made anew from their seeds, a minute or so each on one core, and images are not. The bounds go to
+    STUDY/bounds.parquet; `femoreg tables` and `femoreg report` then tell them beside the errors. Those that are there
+    stay.
+
+    Args:
+        study: folder of a study by `femoreg study`, of procedural patients.
+        protocol: its protocol, a preset of configs/study or a YAML file.
+        condition: its condition; the first one of the protocol, if not given.
+        first: only the first so many finished runs.
+        noise_alone: on so many of these, also register images with nothing but the noise of photons.
+        pixel_mm: edge of the pixels that images are seen on.
+    """
+    path = limits_of(protocol, study, first, pixel_mm, condition, noise_alone, lambda what: print(what, flush=True))
+    print(f"Bounds: {path}. `femoreg tables {study}` tells them.")
+
+
 def listing(first: int | None = None, kind: Kind = "all", out: Path = _OUT) -> None:
     """Which procedures the study has, and which of their cases are there.
 
@@ -256,6 +283,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "trust": trust,
         "ablation": ablation,
         "conditions": conditions,
+        "limits": limits,
         "list": listing,
     }
     try:

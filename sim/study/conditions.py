@@ -212,11 +212,11 @@ class Body:
     def _posed(self, known: Preoperative, drawn: theatre.Procedure, camera: Camera) -> PosedTissue:
         key = digest(drawn.camera_from_pelvis, drawn.femur_rotation, asdict(camera))
         if self._tissue is None or self._tissue[0] != key:
-            ct, labels = self._imaged(known)
+            ct, labels = self.imaged(known)
             self._tissue = key, posed_tissue(ct, labels, known.femur, known.head, drawn, camera)
         return self._tissue[1]
 
-    def _imaged(self, known: Preoperative) -> tuple[Volume, Volume]:
+    def imaged(self, known: Preoperative) -> tuple[Volume, Volume]:
         """The finer scan, in HU, and its labels."""
         if self.procedure.procedural:
             imaged = self._made()[1]

@@ -1,6 +1,6 @@
 """The six images of one procedure: every view without and with the device."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -56,12 +56,21 @@ def simulate_images(
 
 
 def posed_tissue(
-    ct: Volume, labels: Volume, femur: tuple[int, ...], head_centre: Tensor, procedure: Procedure, camera: Camera
+    ct: Volume,
+    labels: Volume,
+    femur: tuple[int, ...],
+    head_centre: Tensor,
+    procedure: Procedure,
+    camera: Camera,
+    apart: Sequence[tuple[int, ...]] = (),
 ) -> PosedTissue:
-    """The part of a patient that the views of a procedure show, after the femur has turned; see `simulate_images`."""
+    """The part of a patient that the views of a procedure show, after the femur has turned; see `simulate_images`.
+
+    `apart` is as in `take_apart`.
+    """
     poses = procedure.camera_from_pelvis
     ct, labels = (field_of_view(volume, poses, camera, _ROOM_MM) for volume in (ct, labels))
-    return take_apart(ct, labels, femur, procedure.femur_rotation, head_centre)
+    return take_apart(ct, labels, femur, procedure.femur_rotation, head_centre, apart)
 
 
 def view_images(

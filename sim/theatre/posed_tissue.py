@@ -1,5 +1,6 @@
 """A patient taken apart for imaging after one femur has turned: the bone moves rigidly, the soft tissue bends."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,24 +21,31 @@ class PosedTissue:
     """Densities in g/cm³ after one femur has turned."""
 
     filled: Volume  # water, and κ times bone; coarse, and bent around the femur
-    bone: Volume  # all bone but the turned femur
+    bone: Volume  # all bone but the turned femur, and what is held apart
     femur: Volume  # the bone of the turned femur, where the CT has it
     lps_from_femur: Tensor  # (4, 4): the turn, LPS mm
+    apart: tuple[Volume, ...] = ()  # bones at rest that were to be held apart
 
 
 def take_apart(
-    ct: Volume, labels: Volume, femur: tuple[int, ...], rotation: Tensor, head_centre: Tensor
+    ct: Volume,
+    labels: Volume,
+    femur: tuple[int, ...],
+    rotation: Tensor,
+    head_centre: Tensor,
+    apart: Sequence[tuple[int, ...]] = (),
 ) -> PosedTissue:
     """The patient of a CT in HU whose femur has turned about its head centre by `rotation`.
 
     `labels` lies on the grid of `ct`, 0 where there is no bone; `femur` holds the ids of the femur that moves.
-    `rotation` (3, 3) acts in LPS; `head_centre` (3,) in LPS mm. Raises `InputError` if the label map holds no such
-    femur.
+    `rotation` (3, 3) acts in LPS; `head_centre` (3,) in LPS mm. `apart` names bones at rest, by the ids of each, that
+    are to be volumes of their own. Raises `InputError` if the label map holds no such femur.
     """
-    filled, bone, (moving,), coarse_labels = separate(ct, labels, [femur])
+    filled, bone, (moving, *others), coarse_labels = separate(ct, labels, [femur, *apart])
     turn = about_point(rigid(rotation), head_centre)
     moving = moving.with_data(moving.data * (1 - _occupied(moving, coarse_labels, femur, turn)))
-    return PosedTissue(rotate_femur(filled, coarse_labels, femur, rotation, head_centre), bone, moving, turn)
+    bent = rotate_femur(filled, coarse_labels, femur, rotation, head_centre)
+    return PosedTissue(bent, bone, moving, turn, tuple(others))
 
 
 def _occupied(moving: Volume, labels: Volume, femur: tuple[int, ...], turn: Tensor) -> Tensor:
@@ -61,5 +69,6 @@ def areal_posed_tissue(
     tissue: PosedTissue, camera_from_lps: Tensor, camera: Camera, step_mm: float
 ) -> dict[str, Tensor]:
     """Mass per area (H, W) in g/cm² of `water` and `bone` of a patient whose femur has turned."""
-    poses = torch.stack([camera_from_lps, camera_from_lps @ tissue.lps_from_femur])
-    return areal_tissue(tissue.filled, camera_from_lps, [tissue.bone, tissue.femur], poses, camera, step_mm)
+    resting = [tissue.bone, *tissue.apart]
+    poses = torch.stack([camera_from_lps] * len(resting) + [camera_from_lps @ tissue.lps_from_femur])
+    return areal_tissue(tissue.filled, camera_from_lps, [*resting, tissue.femur], poses, camera, step_mm)

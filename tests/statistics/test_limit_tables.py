@@ -1,0 +1,93 @@
+"""Errors beside their bounds, on rows that are made up."""
+
+import math
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from study_frames import made_up
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.statistics.figures import all_figures
+from femoreg_torch.statistics.limit_tables import (
+    ALL_IMAGES,
+    BOUND,
+    BOUNDS_NAME,
+    INFORMATION,
+    NOISE,
+    POSES_ALONE,
+    REGISTERED,
+    USUAL,
+    limit_tables,
+    read_bounds,
+    without_name,
+)
+from femoreg_torch.statistics.quantities import POSES, QUANTITIES
+from femoreg_torch.statistics.study import study_tables
+
+SETTINGS = made_up(1)["settings"].iloc[0]
+
+
+def made_up_bounds(condition: str = "plain") -> pd.DataFrame:
+    """Of procedures 1 and 2, the errors of which are some mm: all bounds 0.01 and 0.07, twice as much without one."""
+    rows = []
+    for number, value in ((1, 0.01), (2, 0.07)):
+        head = {"condition": condition, "number": number, "settings": SETTINGS}
+        for unknown, factor in ((POSES_ALONE, 0.5), (USUAL, 1.0)):
+            every = {q.column: factor * value for q in QUANTITIES}
+            rows.append(head | {"what": BOUND, "unknown": unknown, "images": ALL_IMAGES} | every)
+        fewer = {q.column: 2 * value for q in QUANTITIES} | {"device_mm": math.inf}
+        rows.append(head | {"what": BOUND, "unknown": USUAL, "images": without_name("device 1")} | fewer)
+        for image, share in (("anatomy 1", 0.25), ("device 1", 0.75)):
+            rows.append(head | {"what": NOISE, "unknown": USUAL, "images": image, "relative_mm": share})
+            about = {f"{key}_mm": share for key in POSES}
+            rows.append(head | {"what": INFORMATION, "unknown": POSES_ALONE, "images": image} | about)
+    return pd.DataFrame(rows)
+
+
+def test_the_ratio_is_that_of_root_mean_squares_over_the_same_procedures() -> None:
+    rows = made_up(3)
+    rows["number"] = [1, 2, 3]
+    rows["relative_mm"] = [0.3, 0.4, 90.0]  # the third has no bound
+    bounds = made_up_bounds()
+    place = {"condition": "plain", "number": 1, "settings": SETTINGS, "unknown": USUAL, "images": ALL_IMAGES}
+    bounds.loc[len(bounds)] = place | {"what": REGISTERED, "relative_mm": -0.06}
+    limit, worth, shares = limit_tables(rows, bounds)
+    line = next(row for row in limit.rows if row[0] == "entry point to tip, mm")
+    # √((0.09 + 0.16) / 2), then √((0.0001 + 0.0049) / 2) = 0.05 and half of it
+    assert line == ("entry point to tip, mm", "0.354", "0.060", "0.025", "0.050", "7.1")
+    assert limit.columns == ("", "error", "noise alone", f"bound, {POSES_ALONE}", f"bound, {USUAL}", "ratio")
+    cells = dict(zip(worth.columns, worth.rows[1], strict=True))
+    assert (cells["images"], cells["pelvis"], cells["device"]) == ("without device 1", "× 2.00", "× ∞")
+    assert shares.rows[1] == ("device 1", *["75.0 %"] * 6)
+
+
+def test_bounds_of_another_condition_say_nothing() -> None:
+    rows = made_up(3)
+    rows["number"] = [1, 2, 3]
+    assert limit_tables(rows, made_up_bounds("other")) == []
+    assert limit_tables(rows.assign(settings="others"), made_up_bounds()) == []
+    two = pd.concat([rows, made_up(3, condition="other").assign(number=[1, 2, 3])], ignore_index=True)
+    tables = study_tables(two, 0, made_up_bounds("other"))
+    names = {group: {table.name for table in own} for group, own in tables.items()}
+    assert {"limits", "worth", "shares"} <= names["other"]
+    assert not {"limits", "worth", "shares"} & (names["plain"] | names["all"])
+
+
+def test_a_figure_holds_every_error() -> None:
+    rows = made_up(3)
+    rows["number"] = [1, 2, 3]
+    plot = next(plot for plot in all_figures(rows, made_up_bounds()) if plot.name == "limits")
+    labels = [len(axes.get_yticks()) for axes in plot.figure.axes]
+    assert sum(labels) == len(QUANTITIES)
+    assert "limits" not in {plot.name for plot in all_figures(rows)}
+
+
+def test_a_file_that_holds_no_bounds_is_refused(tmp_path: Path) -> None:
+    assert read_bounds(tmp_path) is None
+    (tmp_path / BOUNDS_NAME).write_text("no parquet")
+    with pytest.raises(InputError, match="cannot be read as Parquet"):
+        read_bounds(tmp_path)
+    pd.DataFrame({"number": [1]}).to_parquet(tmp_path / BOUNDS_NAME)
+    with pytest.raises(InputError, match="has no column condition, settings"):
+        read_bounds(tmp_path)
