@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-# Several processes of tests share the machine's cores. Libraries read these when they are first imported, so they stand here.
+# Several processes of tests share the machine's cores. Libraries read these when they are first imported.
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
     _threads = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
     for _library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):

@@ -8,7 +8,7 @@ Everything is fitted on pixels of about 1 mm, in mm on the detector.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -36,6 +36,11 @@ _MOST_RATIO = 0.45  # of the grey value beyond the edge to that inside
 _LEAST_SHARP = 0.75  # share of the edge that is as dark and as sharp; an instrument may cross the rest
 _SHARP_ENOUGH = 0.97  # to try no other grey value
 _MOST_RESIDUAL_MM = 0.7
+_SAME_WAY = 0.9  # cosine between the normals of one blade found twice
+_LEAST_REACH = 0.15  # of a blade from the middle, of half the diagonal
+_LEAST_BLADE = 0.4  # length of a blade in the image, of half the detector's side
+_BLADE_STEP_MM = 2.0  # between places where a blade may be
+_MOST_BEYOND = 0.6  # of the grey value anywhere beyond a blade to that inside
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -80,6 +85,7 @@ def find_shutter(raw: Tensor, camera: Camera) -> Shutter | None:
             break
     if best is None:
         return None
+    best = _with_other_blades(best, image, grid)
     rows, columns = (torch.arange(n, dtype=torch.float64) for n in raw.shape)
     # from the middle of the coarse pixels' first to pixels of the image
     x = (columns + 0.5) * camera.pixel_mm[1] - 0.5 * grid.pixel_mm[0]
@@ -239,6 +245,50 @@ def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
         return None
     fit = _Fit(refined, sharp / total)
     return fit if fit.inside(grid.middle[None]).all() else None
+
+
+def _with_other_blades(fit: _Fit, image: Array, grid: _Grid) -> _Fit:
+    """A fit with the blades whose shadow no single grey value shows: beside a bright field, scattered light fills it.
+
+    Blades stand parallel or at right angles to those that were found, and all that lies beyond is darker than the field
+    beside it.
+    """
+    sides = list(fit.sides)
+    found = [side for side in sides if isinstance(side, _Line)]
+    ways = [way for line in found[:1] for way in (line.normal, -line.normal, line.normal[::-1] * [-1, 1])]
+    ways += [-ways[2]] if ways else []
+    for normal in ways:
+        if any(line.normal @ normal > _SAME_WAY for line in found) or len(found) == _MOST_SIDES:
+            continue
+        reach = float(np.linalg.norm(grid.middle))
+        blades = []
+        for beyond_middle in np.arange(_LEAST_REACH * reach, reach, _BLADE_STEP_MM):
+            line = _Line(normal, float(grid.middle @ normal + beyond_middle))
+            kept, share = _blade(line, sides, image, grid)
+            if share >= _LEAST_SHARP:
+                blades.append((len(kept), line.refitted(kept)))
+        if blades:
+            best = max(blades, key=lambda blade: blade[0])[1]
+            found.append(best)
+            sides.append(best)
+    return replace(fit, sides=sides)
+
+
+def _blade(line: _Line, sides: list[_Circle | _Line], image: Array, grid: _Grid) -> tuple[Array, float]:
+    """Where a line within all sides is a sharp edge with only shadow beyond (N, 2), and along what share of it."""
+    places = line.edge(2 * grid.edge_mm, grid)
+    within = np.all([side.depth(places) >= 0 for side in sides], axis=0)
+    places = places[grid.within(places) & within]
+    if len(places) * 2 * grid.edge_mm < _LEAST_BLADE * float(grid.middle.min()):
+        return places, 0.0
+    kept, known = _sharp_edge(image, places, line.outwards(places), grid)
+    if not known or len(kept) < _LEAST_SHARP * known:
+        return kept, 0.0
+    inner = grid.values(image, kept - _NEAR_MM * line.normal)
+    steps = np.arange(_NEAR_MM, 2 * float(np.linalg.norm(grid.middle)), 2 * grid.edge_mm)
+    outside = grid.values(image, kept[:, None] + steps[:, None] * line.normal)
+    dark = np.isnan(outside) | (outside < _MOST_BEYOND * inner[:, None])
+    return kept, float(dark.all(1).sum()) / known
 
 
 def _sharp_edge(image: Array, places: Array, outwards: Array, grid: _Grid) -> tuple[Array, int]:

@@ -79,6 +79,19 @@ def test_the_field_is_found(name: str, dense: float) -> None:
     assert not (found.field & ~exposed).any()
 
 
+@pytest.mark.parametrize("degrees", [0, 17, -31])
+def test_blades_beside_a_bright_field_are_found_though_scattered_light_fills_their_shadow(degrees: float) -> None:
+    """Beside open air their shadow is brighter than what lies behind bones: no grey value parts shadow and field."""
+    exposed = turned(degrees, (150, 125)).exposed((SIZE, SIZE))
+    thickness = 1.0 + 3.2 * (COLUMN / SIZE + 1 - ROW / SIZE) / 2  # the lower left corner is thin
+    beam = 60000 * torch.exp(-thickness + 0.4 * smooth((anatomy() < 900).float(), 2.0))
+    light = beam * smooth(exposed.float(), 0.9)
+    light = light + 0.12 * smooth(light, 40.0) + 60
+    found = find_shutter(torch.poisson(light, generator=torch.Generator().manual_seed(1)), CAMERA)
+    assert found is not None
+    assert overlap(found.field, without_penumbra(exposed, CAMERA)) > 0.98
+
+
 def test_instruments_may_cross_the_edge_and_lie_inside() -> None:
     exposed, _ = FIELDS["round"]
     beam = anatomy(2)
