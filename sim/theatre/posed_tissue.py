@@ -24,6 +24,10 @@ class PosedTissue:
     femur: Volume  # the bone of the turned femur, where the CT has it
     lps_from_femur: Tensor  # (4, 4): the turn, LPS mm
 
+    def to(self, device: torch.device) -> "PosedTissue":
+        """The same with its densities on a device."""
+        return PosedTissue(self.filled.to(device), self.bone.to(device), self.femur.to(device), self.lps_from_femur)
+
 
 def take_apart(
     ct: Volume, labels: Volume, femur: tuple[int, ...], rotation: Tensor, head_centre: Tensor
