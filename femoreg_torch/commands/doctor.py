@@ -86,10 +86,9 @@ def machine() -> list[Finding]:
         Finding("cores", f"{cores}, {threads} used", few),
         Finding("free memory", f"{gigabytes:.1f} GB", small),
     ]
-    busy = os.getloadavg()[0]
-    rows.append(
-        Finding("load", f"{busy:.1f}" + (", other programs share the cores: times below say little" * (busy > cores)))
-    )
+    load = os.getloadavg()[0]
+    shared = "; other programs share the cores, so the times below say little" if load > cores else ""
+    rows.append(Finding("load", f"{load:.1f}{shared}"))
     if not torch.cuda.is_available():
         return [*rows, Finding("GPU", f"none: {why_no_gpu()}")]
     reason = why_no_gpu()

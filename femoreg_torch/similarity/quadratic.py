@@ -33,16 +33,18 @@ def similarity_quadratics(
     about: Iterable[tuple[FixedSimilarity, Tensor, Tensor]],
 ) -> list[tuple[float, Tensor, Tensor]]:
     """`similarity_quadratic` of several similarities, each with its image and jacobian; waits for a device once."""
-    similarities, found = [], []
+    similarities: list[FixedSimilarity] = []
+    found: list[tuple[Tensor | float, Tensor, Tensor]] = []
     for similarity, image, jacobian in about:
         similarities.append(similarity)
-        smooth = isinstance(similarity, SmoothFixedSimilarity)
-        found.append(similarity.quadratic(image, jacobian) if smooth else _differentiated(similarity, image, jacobian))
-    quadratics = []
-    for similarity, (cost, scores, hessian) in zip(similarities, _on_the_cpu(found), strict=True):
-        smooth = isinstance(similarity, SmoothFixedSimilarity)
-        quadratics.append((cost, scores, hessian if smooth else _checked(similarity, scores, hessian)))
-    return quadratics
+        if isinstance(similarity, SmoothFixedSimilarity):
+            found.append(similarity.quadratic(image, jacobian))
+        else:
+            found.append(_differentiated(similarity, image, jacobian))
+    return [
+        (cost, scores, _checked(similarity, scores, hessian))
+        for similarity, (cost, scores, hessian) in zip(similarities, _on_the_cpu(found), strict=True)
+    ]
 
 
 def _on_the_cpu(found: Sequence[tuple[Tensor | float, Tensor, Tensor]]) -> list[tuple[float, Tensor, Tensor]]:
@@ -76,7 +78,12 @@ def _differentiated(similarity: FixedSimilarity, image: Tensor, jacobian: Tensor
 
 
 def _checked(similarity: FixedSimilarity, scores: Tensor, hessian: Tensor) -> Tensor:
-    """A hessian without negative curvature. Raises `InputError` for derivatives that are none."""
+    """A hessian without negative curvature. Raises `InputError` for derivatives that are none.
+
+    A similarity that knows its own derivatives is believed.
+    """
+    if isinstance(similarity, SmoothFixedSimilarity):
+        return hessian
     if not (torch.isfinite(hessian).all() and torch.isfinite(scores).all()):
         raise _not_smooth(similarity, "its derivatives are not finite")
     if scores.any() and not hessian.any():
