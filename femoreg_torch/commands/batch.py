@@ -146,7 +146,7 @@ def run_jobs(waiting: Sequence[Job], count: int, run: Callable[[Job], Row] | Non
     from multiprocessing import get_context
 
     def attempt(some: Sequence[Job], at_once: int) -> Iterator[tuple[Job, Row | None]]:
-        with ProcessPoolExecutor(at_once, get_context("spawn")) as pool:
+        with ProcessPoolExecutor(at_once, get_context("spawn"), end_with_parent) as pool:
             running = {pool.submit(run or run_job, job): job for job in some}
             try:
                 for future in as_completed(running):
@@ -167,6 +167,22 @@ def run_jobs(waiting: Sequence[Job], count: int, run: Callable[[Job], Row] | Non
     for job in lost:
         for _, row in attempt([job], 1):
             yield job, row or _bad(job, "failed", "its process was killed, perhaps for lack of memory", 0.0)
+
+
+def end_with_parent() -> None:
+    """End this process when the one that started it is gone, killed say; it would wait for work for ever."""
+    import os
+    from multiprocessing import parent_process
+    from threading import Thread
+
+    parent = parent_process()
+    assert parent is not None  # called in processes of a pool alone
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
 
 
 def run_job(job: Job) -> Row:

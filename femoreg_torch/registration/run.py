@@ -3,6 +3,7 @@
 import platform
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -114,11 +115,21 @@ def register_scene(
     plan = plan if isinstance(plan, Plan) else load_plan(plan)
     clock = {"began": time.perf_counter()}
     report("reading CT and images", 0.0)
-    scene = (prepare_scene(case) if scene is None else scene).to(device)
+    starts = {name: thing.start for name, thing in case.objects.items()}
+    if scene is not None:
+        starts = {name: thing.start for name, thing in scene.objects.items()}
+    placed = [name for name, begin in starts.items() if begin.by_landmarks and name not in (start or {})]
+    looks = plan.needs_segmentations or (bool(placed) and landmarks is None)
+    with ThreadPoolExecutor(max_workers=1) as beside:  # the network is read while the CT is
+        network = None
+        if looks and find is None and case.anatomy is not None:
+            network = beside.submit(network_detector, case, None, device)
+        scene = (prepare_scene(case) if scene is None else scene).to(device)
     if start is not None:
         scene = _started_at(scene, start)
     clock["prepared"] = time.perf_counter()
-    began, scene = _start(case, scene, plan, find, landmarks, report)
+    look = find if network is None else network.result()
+    began, scene = _start(case, scene, plan, look, landmarks, report)
     clock["started"] = time.perf_counter()
     anchor = began.camera1_from_object if scene.needs_landmarks else None
     outcome = run_plan(scene, plan, anchor, seed, report)
@@ -176,21 +187,19 @@ def _start(
     case: Case,
     scene: Scene,
     plan: Plan,
-    find: Detector | None,
+    look: Detector | None,
     landmarks: Mapping[str, Tensor] | None,
     report: Report,
 ) -> tuple[StartRecord, Scene]:
     """The pose that the objects are placed by, and the scene with what the network sees, if a stage asks for it."""
-    look = find
     seen = None
     if plan.needs_segmentations or (scene.needs_landmarks and landmarks is None):
-        if case.anatomy is None and find is None:
+        if look is None:
             raise InputError(
                 f"{case.folder}/case.yaml: no network knows the landmarks of {scene.anchor}. Name an `anatomy`, or "
                 "give the landmarks in the image (--landmarks) or a start pose (--start)."
             )
         report("finding landmarks", 0.0)
-        look = find or network_detector(case, device=scene.device)
         seen = look_at(scene, 0, look)
     if not scene.needs_landmarks:
         began = StartRecord(scene.anchor, scene.start().camera1_from[scene.anchor], "poses that were given")

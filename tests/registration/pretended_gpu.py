@@ -107,6 +107,8 @@ class PretendedGpu(TorchFunctionMode):
         before = self.holds(tensor)
         after = {"cpu": False, "cuda": True, "to": before}[name]
         others: list[Any] = []
+        flags = [value for value in args if isinstance(value, bool)]  # non_blocking, copy
+        args = [value for value in args if not isinstance(value, bool)]
         for value in (*args, *(kwargs.pop(key) for key in ("device", "other") if key in kwargs)):
             if isinstance(value, str | torch.device):
                 after = torch.device(value).type == "cuda"
@@ -115,7 +117,7 @@ class PretendedGpu(TorchFunctionMode):
                 others.append(value.dtype)
             elif value is not None:
                 others.append(value)
-        waits = not kwargs.pop("non_blocking", False) or before
+        waits = not kwargs.pop("non_blocking", any(flags[:1])) or before
         moved: Tensor = Tensor.to(tensor, *others, **kwargs) if others or kwargs else tensor
         if before == after:
             return self.take(moved) if after else moved
