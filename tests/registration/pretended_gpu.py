@@ -89,7 +89,7 @@ class PretendedGpu(TorchFunctionMode):
             kwargs["device"] = "cpu"
         if there and name in _NUMPY:
             raise TypeError("can't convert cuda:0 device type tensor to numpy")
-        if there and name not in ("__get__", "__set__"):
+        if there and name not in ("__get__", "__set__", "_has_compatible_shallow_copy_type"):  # the last: `Module.to`
             apart = [tensor for tensor in tensors if tensor.ndim and not self.holds(tensor)]
             if apart:
                 raise RuntimeError(f"{name}: tensors on two devices, {[tuple(t.shape) for t in tensors]}")

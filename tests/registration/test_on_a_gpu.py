@@ -136,6 +136,7 @@ def test_gradient_orientation_has_the_costs_of_the_cpu(scene: Scene, gpu: Preten
     torch.testing.assert_close(there(deltas), here(deltas), rtol=1e-3, atol=1e-3)  # directions jump at flat places
 
 
+@pytest.mark.long
 def test_a_plan_ends_where_it_ends_on_the_cpu(scene: Scene, gpu: PretendedGpu | None) -> None:
     """All kinds of steps, and what is asked of the result."""
     search = LevenbergMarquardt(max_iterations=6, candidates=8, starts=1)
