@@ -1,5 +1,7 @@
 """Where the time of `femoreg register` goes: imports, reading, detection, each stage, quality, writing.
 
+Beside the seconds stand the evaluations of each stage and the samples that the projector takes along its rays.
+
     python benchmarks/procedure.py CASE [--runs 5] [--cores 2 1]
 
 Every run is the command in a process of its own. The table holds the median of each row.
@@ -15,7 +17,8 @@ import time
 from pathlib import Path
 from statistics import median
 
-from measure import machine, table, write_section
+from measure import in_own_process, machine, table, write_section
+from samples import samples_of_a_registration
 
 _COMMAND = "import sys; from femoreg_torch.commands.main import main; sys.exit(main())"
 _IMPORTS = "import femoreg_torch.commands.register, femoreg_torch.registration.run, femoreg_torch.evaluation"
@@ -81,11 +84,26 @@ def main() -> None:
         columns.append({part: median(run[0][part] for run in runs) for part in runs[0][0]})
         evaluations = evaluations or runs[0][1]
         peaks.append(max(run[2] for run in runs))
+    taken = in_own_process(samples_of_a_registration, settings.case)
+    marched = {name if name == "quality" else f"stage: {name}": number for name, number in taken.items()}
+    marched["detection"] = marched.pop("stage: finding landmarks", 0)
+    marched["**whole command**"] = sum(taken.values())
     rows = [
-        [part, str(evaluations.get(part, "")), *(f"{column[part]:.2f}" for column in columns)] for part in columns[0]
+        [
+            part,
+            str(evaluations.get(part, "")),
+            f"{marched[part] / 1e6:,.0f}" if part in marched else "",
+            *(f"{column[part]:.2f}" for column in columns),
+        ]
+        for part in columns[0]
     ]
-    rows.append(["most memory, MiB", "", *(f"{peak:.0f}" for peak in peaks)])
-    header = ["part", "evaluations", *(f"{cores} core{'s' * (cores > 1)}: s" for cores in settings.cores)]
+    rows.append(["most memory, MiB", "", "", *(f"{peak:.0f}" for peak in peaks)])
+    header = [
+        "part",
+        "evaluations",
+        "samples: millions",
+        *(f"{cores} core{'s' * (cores > 1)}: s" for cores in settings.cores),
+    ]
     text = (
         f"{machine('cpu', ())}\n\nPreset `fast`, six images of 1,536 × 1,536 pixels; median of {settings.runs} runs "
         f"of the command, each in a process of its own.\n\n{table(header, rows)}"

@@ -83,6 +83,7 @@ def simulate(
     seed: int = 1,
     side: Literal["left", "right"] | None = None,
     config: str = "paper",
+    device: Literal["cpu", "cuda", "auto"] = "cpu",
 ) -> None:
     """Simulate the six-image acquisition of the paper: a complete case folder with its truth.
 
@@ -92,13 +93,17 @@ def simulate(
         seed: The same seed gives the same poses and the same images.
         side: Hip to be operated; that of case.yaml, or the left one, if not given.
         config: Preset of `configs/simulation`, or a YAML file.
+        device: Where rays are cast: cpu, cuda (the first GPU), or auto, a GPU where there is one. Noise is drawn on the
+            CPU, so that a seed gives the same image but for rounding.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+    from femoreg_torch.commands.telling import tell_device
     from sim.theatre.case_folders import SIMULATION_STEPS, write_simulation
 
     console = Console()
+    place = tell_device(console, device)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("reading the patient", total=SIMULATION_STEPS)
@@ -106,7 +111,7 @@ def simulate(
         def report(step: str) -> None:
             progress.update(task, advance=1, description=step)
 
-        write_simulation(case, out, seed, side, config, report)
+        write_simulation(case, out, seed, side, config, report, device=place)
     console.print(f"Simulated case {seed} written to {out} (look at {out / 'preview.png'})")
 
 

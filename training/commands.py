@@ -13,7 +13,7 @@ def train(
     override: list[str] | None = None,
     start: Path | None = None,
     resume: bool = False,
-    accelerator: Literal["cpu", "cuda", "auto"] = "cpu",
+    device: Literal["cpu", "cuda", "auto"] = "cpu",
     devices: int = 1,
     nodes: int = 1,
 ) -> None:
@@ -31,14 +31,19 @@ def train(
         override: settings as group.key=value, for instance '[optimisation.epochs=3, cohort.views=10]'.
         start: weights (safetensors) to begin with instead of random ones.
         resume: continue from the last checkpoint in OUT.
-        accelerator: cpu, cuda, or whichever is there.
-        devices: how many of them per node; a step then takes a batch on each.
+        device: where to train: cpu, cuda, or auto, GPUs where there are any.
+        devices: how many GPUs, or processes on the CPU, per node; a step then takes a batch on each.
         nodes: how many machines; start the command on each, as Lightning's documentation says for your cluster.
     """
-    from training.run import Machine, train_network
+    from rich.console import Console
+
+    from femoreg_torch.commands.telling import tell_device
+
+    place = tell_device(Console(), device)
+    from training.run import Machine, train_network  # takes seconds
     from training.settings import read_settings
 
-    machine = Machine(accelerator, devices, nodes)
+    machine = Machine(place.type, devices, nodes)
     train_network(
         read_settings(settings, override or []), cases or [], out, cache or out / "cache", start, resume, machine
     )

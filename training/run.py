@@ -38,7 +38,7 @@ _MONITORED = "validation/loss"
 class Machine:
     """Where to train, in Lightning's words."""
 
-    accelerator: str = "cpu"  # or cuda, auto
+    accelerator: str = "cpu"  # or cuda
     devices: int = 1  # per node
     nodes: int = 1
 

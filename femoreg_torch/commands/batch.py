@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,6 +21,7 @@ class Job:
     seed: int
     weights: Path | None
     threads: int
+    device: str = "cpu"
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ def batch(
     jobs: int = 1,
     again: bool = False,
     require_trust: bool = False,
+    device: Literal["cpu", "cuda", "auto"] = "cpu",
 ) -> int:
     """Register many cases, several at a time, and write one table of what became of them.
 
@@ -62,14 +64,15 @@ def batch(
         jobs: Cases at the same time. The cores are shared among them; each needs some 2 GB of memory.
         again: Register all cases anew.
         require_trust: End with status 3 if a result is not trusted.
+        device: Where to compute, as for `femoreg register`; all jobs share one GPU.
     """
     from rich.console import Console
 
     from femoreg_torch.commands.status import BAD_INPUT, DONE, NOT_TRUSTED
-    from femoreg_torch.commands.telling import progress_report
+    from femoreg_torch.commands.telling import progress_report, tell_device
 
     console = Console()
-    waiting = _jobs(cases, out, preset, seed, weights, jobs)
+    waiting = _jobs(cases, out, preset, seed, weights, jobs, tell_device(console, device).type)
     out.mkdir(parents=True, exist_ok=True)
     rows = {} if again else {job.case: row for job in waiting if (row := kept(job)) is not None}
     left = [job for job in waiting if job.case not in rows]
@@ -87,7 +90,9 @@ def batch(
     return NOT_TRUSTED if require_trust and not all(row.trusted for row in table) else DONE
 
 
-def _jobs(cases: Sequence[Path], out: Path, preset: str, seed: int, weights: Path | None, count: int) -> list[Job]:
+def _jobs(
+    cases: Sequence[Path], out: Path, preset: str, seed: int, weights: Path | None, count: int, device: str
+) -> list[Job]:
     """What is to be done. Raises `InputError` for cases that would be written to one place, and for no jobs."""
     import os
 
@@ -104,7 +109,9 @@ def _jobs(cases: Sequence[Path], out: Path, preset: str, seed: int, weights: Pat
                 f"{names.count(name)} cases are called {name!r}: their runs would be one folder. Rename them."
             )
     threads = max(1, len(os.sched_getaffinity(0)) // count)
-    return [Job(case, out / name, preset, seed, weights, threads) for case, name in zip(cases, names, strict=True)]
+    return [
+        Job(case, out / name, preset, seed, weights, threads, device) for case, name in zip(cases, names, strict=True)
+    ]
 
 
 def kept(job: Job) -> Row | None:
@@ -139,7 +146,7 @@ def run_jobs(waiting: Sequence[Job], count: int, run: Callable[[Job], Row] | Non
     from multiprocessing import get_context
 
     def attempt(some: Sequence[Job], at_once: int) -> Iterator[tuple[Job, Row | None]]:
-        with ProcessPoolExecutor(at_once, get_context("spawn")) as pool:
+        with ProcessPoolExecutor(at_once, get_context("spawn"), end_with_parent) as pool:
             running = {pool.submit(run or run_job, job): job for job in some}
             try:
                 for future in as_completed(running):
@@ -162,6 +169,22 @@ def run_jobs(waiting: Sequence[Job], count: int, run: Callable[[Job], Row] | Non
             yield job, row or _bad(job, "failed", "its process was killed, perhaps for lack of memory", 0.0)
 
 
+def end_with_parent() -> None:
+    """End this process when the one that started it is gone, killed say; it would wait for work for ever."""
+    import os
+    from multiprocessing import parent_process
+    from threading import Thread
+
+    parent = parent_process()
+    assert parent is not None  # called in processes of a pool alone
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
+
+
 def run_job(job: Job) -> Row:
     """Register one case in this process; what goes wrong becomes a row."""
     import time
@@ -176,7 +199,8 @@ def run_job(job: Job) -> Row:
     numba.set_num_threads(job.threads)  # or its kernels take all cores, and torch's next ones with them
     began = time.perf_counter()
     try:
-        result, _ = register_into(job.out, job.case, job.preset, job.seed, weights=job.weights)
+        device = torch.device(job.device)
+        result, _ = register_into(job.out, job.case, job.preset, job.seed, weights=job.weights, device=device)
     except (InputError, OSError) as error:
         return _bad(job, "refused", " ".join(str(error).split()), time.perf_counter() - began)
     except Exception as error:  # a defect: told with its place, and the other cases go on

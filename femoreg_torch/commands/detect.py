@@ -11,6 +11,7 @@ def detect(
     carm: str = "cios_fusion",
     intensity: Literal["raw", "log"] = "raw",
     weights: Path | None = None,
+    device: Literal["cpu", "cuda", "auto"] = "cpu",
 ) -> None:
     """Find the 14 hip landmarks and the bones in fluoroscopic images.
 
@@ -25,9 +26,11 @@ def detect(
         carm: C-arm that the images come from: a preset, or a YAML file such as configs/carm/cios_fusion.yaml.
         intensity: raw (bone dark) or log (attenuation, bone bright).
         weights: network weights (safetensors); by default the shipped ones.
+        device: where the network computes: cpu, cuda (the first GPU), or auto, a GPU where there is one.
     """
     from rich.console import Console
 
+    from femoreg_torch.commands.telling import tell_device
     from femoreg_torch.detect import detect as find
     from femoreg_torch.detect import filled, load_network, within_field
     from femoreg_torch.detect.writing import write_detections
@@ -41,7 +44,8 @@ def detect(
     if repeated:
         raise InputError(f"images: the name {min(repeated)} stands there twice. Rename one, results go by this name.")
     camera = load_carm(carm).camera
-    network = load_network(weights)
+    console = Console()
+    network = load_network(weights, tell_device(console, device))
     stored = [read_image(path) for path in images]
     for path, image in zip(images, stored, strict=True):
         check_matches(image, camera, f"{path}:")
@@ -54,7 +58,6 @@ def detect(
         attenuation.append(shown)
         detections.append(found if field is None else within_field(found, field))
     write_detections(out, images, attenuation, detections, camera)
-    console = Console()
     for path, detection in zip(images, detections, strict=True):
         count = int(detection.visible.sum())
         remarks = [

@@ -16,20 +16,21 @@ def doctor() -> int:
     """Look at this machine: versions, cores, memory, GPU; check the projector against a formula, and its speed.
 
     Takes some ten seconds. The projector runs on the CPU and on each GPU that torch sees; its images and derivatives
-    are compared with the line integrals of a Gaussian ball, which have a formula. Ends with status 1 if something is
-    wrong that would make results wrong or impossible.
+    are compared with the line integrals of a Gaussian ball, which have a formula. So is what a stage of a registration
+    minimises, its gradient and its curvature, with plain formulas in double precision. Ends with status 2 if something
+    is wrong that would make results wrong or impossible.
     """
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    from femoreg_torch.commands.status import AMISS, DONE
+    from femoreg_torch.commands.status import BAD_INPUT, DONE
 
     console = Console()
     findings = [*software(), *machine(), *network()]
     with console.status("checking the projector"):
         for device in devices():
-            findings += projector(device)
+            findings += [*projector(device), *objective(device)]
     table = Table(show_header=False, box=None)
     for finding in findings:
         mark = "[green]✓[/]" if finding.amiss is None else "[bold red]✗[/]"
@@ -40,7 +41,7 @@ def doctor() -> int:
         console.print(f"[bold red]{escape(finding.what)}:[/] {escape(finding.amiss or '')}")
     if not amiss:
         console.print("[green]Nothing is amiss.[/]")
-    return AMISS if amiss else DONE
+    return BAD_INPUT if amiss else DONE
 
 
 def software() -> list[Finding]:
@@ -56,6 +57,10 @@ def software() -> list[Finding]:
             rows.append(Finding(name, version(name)))
         except PackageNotFoundError:
             rows.append(Finding(name, "missing", f"is not installed: pip install {name}"))
+    try:
+        rows.append(Finding("Triton", version("triton")))
+    except PackageNotFoundError:
+        rows.append(Finding("Triton", "none (it is needed on a GPU alone)"))
     return rows
 
 
@@ -65,6 +70,8 @@ def machine() -> list[Finding]:
 
     import numba
     import torch
+
+    from femoreg_torch.drr.device import why_no_gpu
 
     cores = len(os.sched_getaffinity(0))
     threads = min(torch.get_num_threads(), numba.get_num_threads())
@@ -79,10 +86,14 @@ def machine() -> list[Finding]:
         Finding("cores", f"{cores}, {threads} used", few),
         Finding("free memory", f"{gigabytes:.1f} GB", small),
     ]
+    load = os.getloadavg()[0]
+    shared = "; other programs share the cores, so the times below say little" if load > cores else ""
+    rows.append(Finding("load", f"{load:.1f}{shared}"))
     if not torch.cuda.is_available():
-        built = torch.version.cuda or torch.version.hip
-        told = f"none (torch is built for {built}, but sees no GPU)" if built else "none (torch is built for the CPU)"
-        return [*rows, Finding("GPU", told)]
+        return [*rows, Finding("GPU", f"none: {why_no_gpu()}")]
+    reason = why_no_gpu()
+    if reason is not None:
+        rows.append(Finding("GPU", "of no use", f"{reason}: take --device cpu"))
     for number in range(torch.cuda.device_count()):
         properties = torch.cuda.get_device_properties(number)
         rows.append(Finding(f"GPU {number}", f"{properties.name}, {properties.total_memory / 1e9:.0f} GB"))
@@ -132,3 +143,28 @@ def projector(name: str) -> list[Finding]:
         Finding(what, f"off by {deviations} at most", None if found.holds else wrong),
         Finding(f"speed on {name}", speed),
     ]
+
+
+def objective(name: str) -> list[Finding]:
+    """Parity of a stage's objective on a device."""
+    import torch
+
+    from femoreg_torch.errors import InputError
+    from femoreg_torch.registration.parity import (
+        MOST_CURVATURE,
+        MOST_GRADIENT,
+        MOST_VALUE,
+        objective_parity,
+    )
+
+    what = f"objective on {name}"
+    try:
+        found = objective_parity(torch.device(name))
+    except InputError as error:
+        return [Finding(what, "does not run", f"{error}")]
+    off = f"off by {found.value:.0e}, gradient {found.gradient:.0e}, curvature {found.curvature:.0e} of its size"
+    wrong = (
+        f"deviates from plain formulas by more than {MOST_VALUE:.0e}, {MOST_GRADIENT:.0e} or {MOST_CURVATURE:.0e}: do "
+        "not use this device, and please report it with this table"
+    )
+    return [Finding(what, off, None if found.holds else wrong)]

@@ -27,7 +27,7 @@ GROUP = "femoreg_torch.commands"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `femoreg` with these arguments (those of the process if None) and return its exit status.
 
-    0: done; 1: `doctor` found something amiss, or a run of a study failed; 2: bad input, told in one line on stderr;
+    0: done; 1: a run of a study failed; 2: bad input, told in one line on stderr, or `doctor` found something amiss;
     3: done, but not trusted; 130: interrupted. Whatever else goes wrong is a defect and keeps its traceback.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)

@@ -1,9 +1,11 @@
 """`femoreg register`: from a case folder to poses."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
+    import torch
+
     from femoreg_torch.case import Case, Result
     from femoreg_torch.registration.workflow import Report
 
@@ -19,6 +21,7 @@ def register(
     start: Path | None = None,
     robot: Path | None = None,
     require_trust: bool = False,
+    device: Literal["cpu", "cuda", "auto"] = "cpu",
 ) -> int:
     """Register the objects of a case, such as femur and device, to its fluoroscopic images.
 
@@ -42,19 +45,31 @@ def register(
             `camera1_from_<object>`, 4×4 in mm, for each object that is to start there, such as an earlier result.json.
         robot: Calibration of the robot, to have the motion in its base frame too: see `femoreg navigate --help`.
         require_trust: End with status 3 if the result is not trusted.
+        device: Where volumes and images lie, and are drawn and compared: cpu, cuda (the first GPU), or auto, a GPU
+            where there is one. Run `femoreg doctor` before you trust a GPU.
     """
     from rich.console import Console
     from rich.markup import escape
 
     from femoreg_torch.case import RESULT_NAME
     from femoreg_torch.commands.status import NOT_TRUSTED
-    from femoreg_torch.commands.telling import progress_report, tell_verdict
+    from femoreg_torch.commands.telling import progress_report, tell_device, tell_verdict
     from femoreg_torch.navigation import summary
 
     console = Console()
+    place = tell_device(console, device)
     with progress_report(console, "reading the case") as report:
         result, navigation = register_into(
-            out, case, preset, seed, weights=weights, landmarks=landmarks, start=start, robot=robot, report=report
+            out,
+            case,
+            preset,
+            seed,
+            weights=weights,
+            landmarks=landmarks,
+            start=start,
+            robot=robot,
+            device=place,
+            report=report,
         )
     tell_verdict(console, result)
     for line in [] if navigation is None else summary(navigation):
@@ -73,9 +88,12 @@ def register_into(
     landmarks: Path | None = None,
     start: Path | None = None,
     robot: Path | None = None,
+    device: "torch.device | None" = None,
     report: "Report | None" = None,
 ) -> "tuple[Result, dict[str, Any] | None]":
     """Register the case in a folder and write all that belongs to its run into `out`; see `register`.
+
+    Without a `device`, it computes on the CPU.
 
     Returns the result, and the content of navigation.json if there is any. Raises `InputError`.
     """
@@ -84,6 +102,7 @@ def register_into(
 
     from femoreg_torch.case import RESULT_NAME, new_folder, read_case, result_content, write_json
     from femoreg_torch.case.start_files import read_pixels, read_start_poses
+    from femoreg_torch.drr import CPU
     from femoreg_torch.errors import InputError
     from femoreg_torch.evaluation import EVALUATION_NAMES, evaluate
     from femoreg_torch.navigation import NAVIGATION_NAMES, navigation_content, read_robot, write_navigation
@@ -99,9 +118,10 @@ def register_into(
         None,
         preset,
         seed=seed,
-        find=None if weights is None else network_detector(case, weights),
+        find=None if weights is None else network_detector(case, weights, device or CPU),
         landmarks=None if landmarks is None else read_pixels(landmarks),
         start=None if start is None else read_start_poses(start),
+        device=device or CPU,
         report=report or silent,
     )
     result = replace(

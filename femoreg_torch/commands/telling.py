@@ -3,11 +3,14 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from femoreg_torch.case import Result
+from femoreg_torch.drr import DeviceName, chosen_device
+from femoreg_torch.drr.device import told, why_no_gpu
 
 
 @contextmanager
@@ -21,6 +24,15 @@ def progress_report(console: Console, first: str) -> Iterator[Callable[[str, flo
             progress.update(task, completed=share, description=step)
 
         yield report
+
+
+def tell_device(console: Console, name: DeviceName) -> torch.device:
+    """The device of a name, see `chosen_device`; which one `auto` took is told."""
+    device = chosen_device(name)
+    if name == "auto":
+        reason = why_no_gpu()
+        console.print(f"Computing on {told(device)}" + (f": {reason}." if reason else "."), markup=False)
+    return device
 
 
 def tell_verdict(console: Console, result: Result) -> None:

@@ -22,5 +22,5 @@ def within_field(detection: Detection, field: Tensor) -> Detection:
     columns, rows = detection.pixels.nan_to_num(-1).round().long().T
     height, width = field.shape
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    exposed = inside & field[rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
+    exposed = inside & field.cpu()[rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
     return replace(detection, visible=torch.logical_and(detection.visible, exposed))

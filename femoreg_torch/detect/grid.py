@@ -51,5 +51,5 @@ def to_network_grid(image: Tensor, camera: Camera) -> Tensor:
     row, column = torch.meshgrid(axis, axis, indexing="ij")
     index = image_from_network(torch.stack([column, row], -1), camera) - late
     size = torch.tensor(camera.shape[::-1], dtype=torch.float64)
-    unit = ((2 * index + 1) / size - 1).to(image.dtype)  # pixel centres at integers to grid_sample's −1 … 1
+    unit = ((2 * index + 1) / size - 1).to(image)  # pixel centres at integers to grid_sample's −1 … 1
     return F.grid_sample(blurred, unit[None], padding_mode="border", align_corners=False)[0, 0]

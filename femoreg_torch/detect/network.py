@@ -44,14 +44,14 @@ def detect(
     The image is read as it is, turned by 180°, and both again with its grey values inverted. The plain reading is kept
     unless another one expects more landmarks by at least half a landmark. What is kept is then read again with
     test-time augmentation. Raises `InputError` for an image that does not fit the camera, holds values that are not
-    finite, or is constant.
+    finite, or is constant. The network computes where it is; what is found lies on the CPU.
     """
     _check(attenuation, camera)
-    image = normalise(to_network_grid(attenuation.to(torch.float32), camera))
+    image = normalise(to_network_grid(attenuation.to(torch.float32), camera)).to(network.device)
     candidates = {(turned, inverted): _oriented(image, turned, inverted) for inverted in (0, 1) for turned in (0, 1)}
     expected = {key: _expected_landmarks(network, candidate) for key, candidate in candidates.items()}
     turned, inverted = max(expected, key=lambda key: expected[key] - _MARGIN * any(key))
-    prediction = predict(network, candidates[turned, inverted], augmentations)
+    prediction = predict(network, candidates[turned, inverted], augmentations).cpu()
     positions, confidence = decode_heatmaps(prediction.heatmaps, prediction.absence)
     deviation = expected_error(prediction.heatmaps, positions, network.sigma_px)
     segmentation = prediction.segmentation.softmax(0)
@@ -83,7 +83,7 @@ def _oriented(image: Tensor, turned: int, inverted: int) -> Tensor:
 
 def _expected_landmarks(network: LandmarkNetwork, image: Tensor) -> float:
     """The number of landmarks to expect in a normalised image on the network's grid, without augmentation."""
-    prediction = predict(network, image, PLAIN)
+    prediction = predict(network, image, PLAIN).cpu()
     return decode_heatmaps(prediction.heatmaps, prediction.absence)[1].sum().item()
 
 

@@ -55,15 +55,19 @@ class LogProbabilities:
     heatmaps: Tensor  # (L, h, w); with `absence` one distribution per landmark, up to a factor
     absence: Tensor  # (L,)
 
+    def cpu(self) -> "LogProbabilities":
+        """The same there."""
+        return LogProbabilities(self.segmentation.cpu(), self.heatmaps.cpu(), self.absence.cpu())
+
 
 @torch.inference_mode()
 def predict(network: LandmarkNetwork, image: Tensor, augmentations: tuple[Augmentation, ...]) -> LogProbabilities:
-    """The averaged prediction for a normalised `image` (H, W) on the network's grid.
+    """The averaged prediction for a normalised `image` (H, W) on the network's grid, where the image is.
 
     One of the `augmentations` has to leave the image as it is, so that every pixel is seen at least once.
     """
-    there = torch.stack([augmentation.image_from_augmented() for augmentation in augmentations])
-    back = torch.stack([augmentation.augmented_from_image() for augmentation in augmentations])
+    there = torch.stack([augmentation.image_from_augmented() for augmentation in augmentations]).to(image.device)
+    back = torch.stack([augmentation.augmented_from_image() for augmentation in augmentations]).to(image.device)
     grid = F.affine_grid(there, [len(augmentations), 1, *image.shape], align_corners=False)
     moved = F.grid_sample(image.expand(len(augmentations), 1, -1, -1), grid, padding_mode="border", align_corners=False)
     prediction = network.module(moved)
@@ -74,7 +78,7 @@ def predict(network: LandmarkNetwork, image: Tensor, augmentations: tuple[Augmen
     area = torch.linalg.det(back[:, :, :2]).abs().log()
     heatmaps = heatmaps - total[..., None, None] + area[:, None, None, None]
     absence = absence - total
-    mirrored = torch.tensor([augmentation.mirrored for augmentation in augmentations])
+    mirrored = torch.tensor([augmentation.mirrored for augmentation in augmentations]).to(image.device)
     landmarks, classes = list(network.anatomy.mirrored_landmarks), list(network.anatomy.mirrored_classes)
     heatmaps[mirrored], absence[mirrored] = heatmaps[mirrored][:, landmarks], absence[mirrored][:, landmarks]
     segmentation[mirrored] = segmentation[mirrored][:, classes]

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import torch
 from torch import nn
 
 from femoreg_torch.anatomy import HIP, Anatomy, load_anatomy
+from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError
 from femoreg_torch.extensions import find
 from femoreg_torch.settings import read_record
@@ -23,9 +25,14 @@ class LandmarkNetwork:
     anatomy: Anatomy = HIP  # the classes are the background and its bones, the heat maps its landmarks
     sigma_px: float = _SIGMA_PX  # standard deviation of the peak that the heat maps were trained to show
 
+    @property
+    def device(self) -> torch.device:
+        """Where it computes."""
+        return next((weight.device for weight in self.module.parameters()), CPU)
 
-def load_network(path: Path | None = None) -> LandmarkNetwork:
-    """The network of a weights file; without a path, the shipped one.
+
+def load_network(path: Path | None = None, device: torch.device = CPU) -> LandmarkNetwork:
+    """The network of a weights file, without a path the shipped one, on a device.
 
     Raises `InputError` for a file that is missing or holds something else, a kind of network or an anatomy that is not
     known, and weights that do not fit their network, or a network that does not fit its anatomy.
@@ -51,7 +58,7 @@ def load_network(path: Path | None = None) -> LandmarkNetwork:
         raise InputError(
             f"{where}: the weights do not fit a network {weights.kind} of {settings} ({error})."
         ) from error
-    return LandmarkNetwork(module.eval(), anatomy, weights.sigma_px)
+    return LandmarkNetwork(module.eval().to(device), anatomy, weights.sigma_px)
 
 
 def check_counts(classes: int, landmarks: int, anatomy: Anatomy, where: str) -> None:

@@ -29,7 +29,12 @@ def why_not(volume: Volume) -> str | None:
     device = volume.data.device
     if device.type != "cuda":
         return f"the volume is on {device}, not on a CUDA device"
-    return _no_triton() or _too_old(device) or _too_large(volume)
+    return why_no_kernels(device) or _too_large(volume)
+
+
+def why_no_kernels(device: torch.device) -> str | None:
+    """Why these kernels do not run on a CUDA device, in one line; None if they do."""
+    return _no_triton() or _too_old(device)
 
 
 @functools.cache

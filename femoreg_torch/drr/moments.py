@@ -12,9 +12,9 @@ from torch import Tensor
 from femoreg_torch.geometry.camera import Camera
 
 
-def unit_rays(camera: Camera) -> Tensor:
+def unit_rays(camera: Camera, device: torch.device | None = None) -> Tensor:
     """Unit vectors (H, W, 3) float32 from the source through the pixel centres."""
-    positions = camera.pixel_positions()
+    positions = camera.pixel_positions(device=device)
     return (positions / positions.norm(dim=-1, keepdim=True)).to(torch.float32)
 
 

@@ -37,11 +37,11 @@ def project(
     volumes, or (B, V, H, W) if `separate`.
 
     Differentiable in `camera_from_volume` and in the volumes' data. Compiled kernels that skip empty space do the work,
-    on the device of the volumes: numba's on the CPU, Triton's on CUDA, where poses should be as well, as a copy from
-    the CPU waits for the device. Where Triton cannot (`cuda.why_not` tells), the slow plain-torch march steps in, with
+    on the device of the volumes: numba's on the CPU, Triton's on CUDA. Poses may lie there or on the CPU: neither waits
+    for the device. Where Triton cannot (`cuda.why_not` tells), the slow plain-torch march steps in, with
     a warning that says why. A sub-window or a coarser grid is a matter of the camera (`Camera.window`,
     `Camera.downsampled`). Raises `InputError` where shapes or devices do not fit, and for poses that are not finite;
-    these give an image of nan on CUDA, where to look at them would mean to wait.
+    poses on CUDA give an image of nan then, where to look at them would mean to wait.
     """
     if isinstance(volumes, Volume):
         if camera_from_volume.shape[1:] != (4, 4):
@@ -84,13 +84,17 @@ def project_with_jacobian(
         # To move the object is to move the camera's points in it the other way.
         changes = -affines[:, None] @ generators
         if intrinsics:
-            changes = torch.cat([changes, affines[:, None] @ _ray_generators(camera).to(index_from_camera)], 1)
+            by_rays = _ray_generators(camera).to(index_from_camera.device, non_blocking=True)
+            changes = torch.cat([changes, affines[:, None] @ by_rays], 1)
             rates = torch.nn.functional.pad(rates, (0, 4))
-    image, planes = _with_derivatives(volume, affines, changes, rates, camera, offsets_of(middle, step_mm), step_mm)
+    numbers = affines, changes, rates, offsets_of(middle, step_mm)
+    affines, changes, rates, offsets = (n.to(volume.data.device, non_blocking=True) for n in numbers)
+    image, planes = _with_derivatives(volume, affines, changes, rates, camera, offsets, step_mm)
     if intrinsics:
-        rays = unit_rays(camera).to(image.device)
+        rays = unit_rays(camera, image.device)
         turned, stretched = planes[:, 6:9], planes[:, 9:]
-        shares = torch.einsum("hwi,nij,hwj->nhw", rays, _ray_generators(camera)[:3, :3, :3].to(rays), rays)
+        generators = _ray_generators(camera)[:3, :3, :3].to(torch.float32).to(image.device, non_blocking=True)
+        shares = torch.einsum("hwi,nij,hwj->nhw", rays, generators, rays)
         planes = torch.cat([planes[:, :6], turned - shares * stretched], 1)
     return image, planes.movedim(1, -1)
 
@@ -111,7 +115,7 @@ def _with_derivatives(
     if reason := cuda.why_not(volume):
         raise InputError(f"project_with_jacobian: {reason}. Move the volume to the CPU, or use Triton on CUDA.")
     image, derivatives = cuda.jacobian(volume, affines, changes, camera, offsets, step_mm)
-    along = -(derivatives[..., 3:6] * unit_rays(camera).to(image.device)).sum(-1, keepdim=True)
+    along = -(derivatives[..., 3:6] * unit_rays(camera, image.device)).sum(-1, keepdim=True)
     moved = derivatives + rates.to(torch.float32)[:, None, None] * along
     return image, moved.movedim(-1, 1)
 
@@ -153,17 +157,19 @@ def _check(volumes: Sequence[Volume], camera_from_volume: Tensor) -> None:
 
 
 def _index_from_camera(volume: Volume, camera_from_volume: Tensor) -> Tensor:
-    """(B, 4, 4) float64 from mm in the camera frame to (x, y, z) indices, on the device of the volume."""
-    device = volume.data.device
+    """(B, 4, 4) float64 from mm in the camera frame to (x, y, z) indices, where the poses are."""
+    device = camera_from_volume.device
     lps_from_index = volume.lps_from_index.to(device, non_blocking=True)
-    camera_from_index = camera_from_volume.to(device, torch.float64) @ lps_from_index
+    camera_from_index = camera_from_volume.to(torch.float64) @ lps_from_index
     # To check for singular matrices means to wait for the device, so that only the CPU does.
     return torch.linalg.inv_ex(camera_from_index, check_errors=device.type == "cpu").inverse
 
 
 def _project_one(volume: Volume, camera_from_volume: Tensor, camera: Camera, step_mm: float) -> Tensor:
     index_from_camera = _index_from_camera(volume, camera_from_volume)
-    affines, offsets = index_from_camera[:, :3], offsets_of(middle_of(volume, camera_from_volume), step_mm)
+    index_from_camera = index_from_camera.to(volume.data.device, non_blocking=True)
+    offsets = offsets_of(middle_of(volume, camera_from_volume), step_mm).to(volume.data.device, non_blocking=True)
+    affines = index_from_camera[:, :3]
     if volume.data.device.type == "cpu":
         image: Tensor = _CpuProjection.apply(volume.data, affines, offsets, volume, camera, step_mm)
         return image

@@ -33,7 +33,7 @@ def march(data: Tensor, index_from_camera: Tensor, camera: Camera, offsets: Tens
     the source along each ray.
     """
     dtype, device = index_from_camera.dtype, index_from_camera.device
-    ray = camera.pixel_positions(dtype).to(device)
+    ray = camera.pixel_positions(dtype, device)
     ray = ray / ray.norm(dim=-1, keepdim=True)  # (H, W, 3)
     data = data.to(dtype)
     last = torch.tensor(data.shape[::-1], dtype=dtype, device=device)

@@ -17,12 +17,11 @@ _OFF_GRID = 0.25
 
 
 def middle_of(volume: Volume, camera_from_volume: Tensor) -> Tensor:
-    """About the middle of a volume in the camera frame, (B, 3) mm float64, for poses (B, 4, 4)."""
-    device = volume.data.device
-    size = torch.tensor(volume.data.shape[::-1], dtype=torch.float64).to(device, non_blocking=True)
-    lps_from_index = volume.lps_from_index.to(device, torch.float64, non_blocking=True)
-    middle = transform_points(lps_from_index, ((size[None] - 1) / 2).floor() + _OFF_GRID)
-    return transform_points(camera_from_volume.to(device, torch.float64), middle)[:, 0]
+    """About the middle of a volume in the camera frame, (B, 3) mm float64, for poses (B, 4, 4), where these are."""
+    size = torch.tensor(volume.data.shape[::-1], dtype=torch.float64)
+    middle = transform_points(volume.lps_from_index, ((size[None] - 1) / 2).floor() + _OFF_GRID)
+    there = middle.to(camera_from_volume.device, non_blocking=True)
+    return transform_points(camera_from_volume.to(torch.float64), there)[:, 0]
 
 
 def offsets_of(middle: Tensor, step_mm: float) -> Tensor:

@@ -89,10 +89,11 @@ class Camera:
         cx, cy = self.principal_point_px
         return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=dtype)
 
-    def pixel_positions(self, dtype: torch.dtype = torch.float64) -> Tensor:
+    def pixel_positions(self, dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Tensor:
         """Pixel centres (rows, columns, 3) in the camera frame, mm."""
-        y = (torch.arange(self.shape[0], dtype=dtype) - self.principal_point_px[1]) * self.pixel_mm[0]
-        x = (torch.arange(self.shape[1], dtype=dtype) - self.principal_point_px[0]) * self.pixel_mm[1]
+        rows, columns = (torch.arange(n, dtype=dtype, device=device) for n in self.shape)
+        y = (rows - self.principal_point_px[1]) * self.pixel_mm[0]
+        x = (columns - self.principal_point_px[0]) * self.pixel_mm[1]
         grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
         return torch.stack([grid_x, grid_y, torch.full_like(grid_x, self.sdd_mm)], -1)
 

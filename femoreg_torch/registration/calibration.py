@@ -9,7 +9,7 @@ with the path ℓ through each region of the device, its attenuation a, and a fa
 with an additive scatter, as in Seibert and Boone, X-ray scatter removal by deconvolution, Med Phys 15 (1988) 567. Where
 metal is opaque the shadow is S, whatever the metal, so that its darkest places tell S, and lighter ones the
 attenuation. The device's pose is estimated with all that, as a wrong pose looks like a wrong material, and the other
-way round.
+way round. This least squares is sparse and runs on the CPU, with SciPy, wherever the scene lies.
 """
 
 import math
@@ -24,7 +24,7 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from femoreg_torch.case.trace import StageRecord
-from femoreg_torch.drr import project_with_jacobian
+from femoreg_torch.drr import CPU, project_with_jacobian
 from femoreg_torch.geometry import (
     Camera,
     Poses,
@@ -93,7 +93,8 @@ class Calibration:
             if deg > _MOST_DEG or mm > _MOST_MM:
                 told.append(f"{name} not estimated, as it would have moved by {deg:.0f}° and {mm:.0f} mm")
                 continue
-            scene = replace(scene, objects=scene.objects | {name: replace(scene.objects[name], volume=fit.volume)})
+            found = replace(thing, volume=fit.volume.to(scene.device))
+            scene = replace(scene, objects=scene.objects | {name: found})
             poses = poses.with_object(name, fit.camera1_from)
             moving.append(name)
             told.append(f"{name}: {', '.join(f'{a:.2f}' for a in fit.attenuations)}/mm")
@@ -135,7 +136,7 @@ def devices(scene: Scene, poses: Poses) -> list[tuple[str, Kind]]:
 
 def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit | None:
     """Attenuation and pose of a device from images without it and those of `kind` with it; None if none shows it."""
-    thing = scene.objects[name]
+    thing = scene.objects[name].to(CPU)
     share = thing.volume.with_data(_share(thing))
     if thing.materials_known and len(thing.parts) > 1:
         owner, attenuation = _told(thing.parts)
@@ -162,7 +163,7 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
     named = float(thing.volume.data.max())  # of a single solid
     as_named = device.regions == 1 and abs(math.log(max(attenuation[0], 1e-6) / named)) < _AS_NAMED
     return DeviceFit(
-        thing.volume if as_named else device.filled(attenuation),
+        scene.objects[name].volume if as_named else device.filled(attenuation),
         poses.camera1_from[name],
         tuple(attenuation.tolist()),
         {v.view: float((v.corners @ fit[_scatter_of(n, device.regions)]).mean()) for n, v in enumerate(seen)},
@@ -266,10 +267,10 @@ def _views(
         intensities = []
         for k in (scene.first_kind, device.kind):
             image = _LEVEL.image(scene.image(k, view), scene.carm.camera)
-            intensities.append((-image).exp().flatten().double().numpy())
+            intensities.append((-image.cpu()).exp().flatten().double().numpy())
             field = scene.field(k, view)
             if field is not None:
-                covered &= _LEVEL.field(field, scene.carm.camera)
+                covered &= _LEVEL.field(field, scene.carm.camera).cpu()
         chosen = np.flatnonzero(covered.flatten().numpy())
         changes = np.zeros((len(chosen), 6))
         if volume is not None:

@@ -106,7 +106,7 @@ def doubts_about_the_plan(case: Case, scene: Scene) -> tuple[str, ...]:
     if plan is None or plan.object not in scene.objects or case.objects[plan.object].model is not None:
         return ()
     volume = scene.objects[plan.object].volume
-    voxels = transform_points(volume.lps_from_index, volume.data.nonzero().flip(1).double())
+    voxels = transform_points(volume.lps_from_index, volume.data.nonzero().cpu().flip(1).double())
     share = torch.linspace(0, 1, _ALONG, dtype=torch.float64)[:, None]
     path = plan.entry_point + share * (plan.target - plan.entry_point)
     away = cKDTree(voxels.numpy()).query(path.numpy())[0]

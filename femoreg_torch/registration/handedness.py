@@ -61,7 +61,7 @@ def mirror_images(volume: Volume) -> list[Volume]:
     """A volume mirrored at each of the three planes through its centre of mass and across its principal axes."""
     filled = volume.data.nonzero()
     some = filled[:: 1 + len(filled) // _MOST_VOXELS]  # the axes need not be exact
-    mass = volume.data[tuple(some.T)].double()
+    mass, some = volume.data[tuple(some.T)].double().cpu(), some.cpu()
     points = transform_points(volume.lps_from_index, some.flip(1).double())
     centre = (mass[:, None] * points).sum(0) / mass.sum()
     away = points - centre

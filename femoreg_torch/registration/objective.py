@@ -14,7 +14,7 @@ from femoreg_torch.registration.intrinsics import PRIOR_WEIGHT, Intrinsics
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.scene import Body, Kind, Moving, RigidObject, Scene, split
 from femoreg_torch.registration.weights import Weighting, pixel_weights, prepared
-from femoreg_torch.similarity import FixedSimilarity, Similarity, similarity_quadratic
+from femoreg_torch.similarity import FixedSimilarity, Similarity, similarity_quadratics
 
 _STEP = 1e-5  # of a delta, for the derivatives of poses
 
@@ -69,7 +69,7 @@ def _target(
     if len(rigid) < len(bodies):
         moves = set(drawn)
     still = [name for name in drawn if name not in moves]
-    background = torch.zeros(camera.shape)
+    background = torch.zeros(camera.shape, device=scene.device)
     if still:
         where = torch.stack([poses.camera_from(name)[view] for name in still])[None]
         background = project([scene.objects[name].volume for name in still], where, camera, level.step_mm)[0]
@@ -93,9 +93,9 @@ class ImageCosts:
     targets: tuple[_Target, ...]
 
     def __call__(self, deltas: Tensor) -> Tensor:
-        """Costs (P, images) of deltas (P, Σ n_b)."""
+        """Costs (P, images) of deltas (P, Σ n_b), on the CPU; a device is waited for once."""
         apart = deltas.split(1) if self._intrinsics(deltas) else [deltas]  # one camera draws a batch
-        return torch.cat([self._costs(part) for part in apart])
+        return torch.cat([self._costs(part) for part in apart]).cpu()
 
     @property
     def still(self) -> Tensor:
@@ -108,17 +108,33 @@ class ImageCosts:
 
     def without_what_moves(self) -> Tensor:
         """Costs (images,) of what stands still alone."""
-        return torch.cat([target.cost(target.background[None]) for target in self.targets])
+        return torch.cat([target.cost(target.background[None]) for target in self.targets]).cpu()
 
     def quadratics(self, delta: Tensor) -> list[Quadratic]:
-        """Each image's cost about one delta (Σ n_b,), with exact gradient and positive semi-definite curvature."""
-        drawn: dict[tuple[int, str], tuple[Tensor, Tensor]] = {}
+        """Each image's cost about one delta (Σ n_b,), with exact gradient and positive semi-definite curvature.
+
+        All of it on the CPU; a device is waited for once.
+        """
         steps = _STEP * torch.eye(len(delta), dtype=torch.float64)
         for _, chosen in self._intrinsics(torch.eye(len(delta), dtype=torch.float64)):
             steps = steps - _STEP * chosen @ chosen.T
         around = torch.cat([delta[None], delta + steps, delta - steps])  # (1 + 2 n, n)
         motions = self._motions(around)
-        return [self._quadratic(target, around, motions, drawn) for target in self.targets]
+        moving = [target for target in self.targets if target.moving]
+        placed = [self._placed_with_rates(target, around, motions) for target in moving]
+        # What was drawn already, image and Jacobian by view and object.
+        seen: dict[tuple[int, str], tuple[Tensor, Tensor]] = {}
+        drawn = (self._drawn(target, delta, poses, seen) for target, (poses, _) in zip(moving, placed, strict=True))
+        found = iter(zip(similarity_quadratics(drawn), placed, strict=True))
+        models = []
+        for target in self.targets:
+            if target.moving:
+                (cost, scores, hessian), (_, twists) = next(found)
+                models.append(Quadratic(cost, scores @ twists, twists.T @ hessian @ twists))
+            else:
+                nothing = delta.new_zeros(len(delta), len(delta))
+                models.append(Quadratic(float(target.cost(target.background[None])), nothing[:1], nothing))
+        return models
 
     def _costs(self, deltas: Tensor) -> Tensor:
         """Costs (P, images) of deltas that have the intrinsics of the first one.
@@ -170,33 +186,42 @@ class ImageCosts:
             placed = [intrinsics.slides(part)[:, target.view] @ pose for pose in placed]
         return torch.stack(placed, 1)
 
-    def _quadratic(
-        self,
-        target: _Target,
-        around: Tensor,
-        motions: Sequence[tuple[Body, Tensor]],
-        seen: dict[tuple[int, str], tuple[Tensor, Tensor]],
-    ) -> Quadratic:
-        """The cost of one image about the first of deltas (1 + 2 n, n), the others being steps up and down from it.
+    def _placed_with_rates(
+        self, target: _Target, around: Tensor, motions: Sequence[tuple[Body, Tensor]]
+    ) -> tuple[Tensor, Tensor]:
+        """Poses (O, 4, 4) of what moves in an image, and the changes (m, n) of all that is seen by n deltas.
 
-        `seen` holds what was drawn already, image and Jacobian by view and object.
+        They are taken at the first of deltas (1 + 2 n, n), the others being steps up and down from it. Six twists per
+        object, and three intrinsics of the view, span all that the deltas do to an image: m = 6 O, or 6 O + 3.
         """
-        delta = around[0]
-        n = len(delta)
-        if not target.moving:
-            cost = float(target.cost(target.background[None]))
-            return Quadratic(cost, delta.new_zeros(1, n), delta.new_zeros(n, n))
-        drawn, jacobians, twists = target.background, [], []
+        n = around.shape[1]
         every = self._placed(target, around, motions, target.moving).movedim(1, 0)  # (O, 1 + 2 n, 4, 4)
         # Derivatives (O, n, 4, 4) of the poses by the bodies' motions, by central differences, good to some 1e-9.
         rates = (every[:, 1 : n + 1] - every[:, n + 1 :]) / (2 * _STEP)
+        points = [self.objects[name].reference_point for name in target.moving]
+        twists = [
+            twist_rates(change, pose, transform_points(pose, point[None])[0])
+            for point, pose, change in zip(points, every[:, 0], rates, strict=True)
+        ]
+        for intrinsics, chosen in self._intrinsics(torch.eye(n, dtype=torch.float64)):
+            twists.append(intrinsics.by_delta(target.view) @ chosen.T)
+        return every[:, 0], torch.cat(twists)
+
+    def _drawn(
+        self, target: _Target, delta: Tensor, poses: Tensor, seen: dict[tuple[int, str], tuple[Tensor, Tensor]]
+    ) -> tuple[FixedSimilarity, Tensor, Tensor]:
+        """The similarity of an image, what is drawn at a delta (n,), and its changes (H, W, m) by the m twists.
+
+        What moves lies at `poses` (O, 4, 4). `seen` holds what was drawn already.
+        """
+        drawn, jacobians = target.background, []
         camera = self._camera(target, delta[None])
-        refining = self._intrinsics(torch.eye(n, dtype=torch.float64))
-        by_rays = torch.zeros(3, *camera.shape)  # derivatives by the intrinsics
-        for name, pose, change in zip(target.moving, every[:, 0], rates, strict=True):
-            volume = self.objects[name].volume
-            centre = transform_points(pose, self.objects[name].reference_point[None])[0]
+        refining = [intrinsics for intrinsics, _ in self._intrinsics(delta[None])]
+        by_rays = target.background.new_zeros(3, *camera.shape)  # derivatives by the intrinsics
+        for name, pose in zip(target.moving, poses, strict=True):
             if (target.view, name) not in seen:
+                centre = transform_points(pose, self.objects[name].reference_point[None])[0]
+                volume = self.objects[name].volume
                 seen[target.view, name] = project_with_jacobian(
                     volume, pose[None], camera, centre, self.step_mm, intrinsics=bool(refining)
                 )
@@ -204,18 +229,13 @@ class ImageCosts:
             drawn = drawn + image[0]
             planes = jacobian[0].movedim(-1, 0)
             jacobians.append(planes[:6])
-            twists.append(twist_rates(change, pose, centre))
-            for intrinsics, _ in refining:
+            for intrinsics in refining:
                 sliding = intrinsics.slide_rates(target.view, camera.sdd_mm).to(jacobian.dtype)
+                sliding = sliding.to(jacobian.device, non_blocking=True)
                 by_rays = by_rays + planes[6:] + torch.tensordot(sliding, planes[3:6], 1)
-        for intrinsics, chosen in refining:
-            jacobians.append(by_rays)
-            twists.append(intrinsics.by_delta(target.view) @ chosen.T)
-        # Six twists per object, and three intrinsics of the view, span all that the deltas do to this image.
+        jacobians += [by_rays] * len(refining)
         changes = torch.cat(jacobians) * target.imaging.slope(drawn)
-        cost, scores, hessian = similarity_quadratic(target.similarity, target.seen(drawn), changes.movedim(0, -1))
-        by_delta = torch.cat(twists)  # (6 O, or 6 O + 3, n)
-        return Quadratic(cost, scores @ by_delta, by_delta.T @ hessian @ by_delta)
+        return target.similarity, target.seen(drawn), changes.movedim(0, -1)
 
 
 def image_costs(

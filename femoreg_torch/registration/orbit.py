@@ -75,7 +75,7 @@ def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> 
     began = time.perf_counter()
     orbit = scene.carm.orbit(orbit_angles(search.half_range_deg, search.step_deg))  # (N, 4, 4)
     costs = [_costs(scene, poses, search, kind, view, orbit) for kind, _ in search.images(scene, poses, view)]
-    values = torch.stack(costs).mean(0)  # (N,)
+    values = torch.stack(costs).mean(0).cpu()  # (N,)
     best = int(values.argmin())
     seconds = time.perf_counter() - began
     return StageRecord(

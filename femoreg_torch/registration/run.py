@@ -3,6 +3,7 @@
 import platform
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import femoreg_torch
 from femoreg_torch.case import Case, Result, Start, StartRecord
 from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.detect import detect, load_network
+from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import check_rigid
 from femoreg_torch.registration.doubts import doubts
@@ -45,9 +47,12 @@ def silent(step: str, share: float) -> None:
     """A report that tells nobody."""
 
 
-def network_detector(case: Case, weights: Path | None = None) -> Detector:
-    """The landmark network of a weights file, or the shipped one. Raises `InputError` if it knows another body part."""
-    network = load_network(weights)
+def network_detector(case: Case, weights: Path | None = None, device: torch.device = CPU) -> Detector:
+    """The landmark network of a weights file, or the shipped one, on a device.
+
+    Raises `InputError` if it knows another body part.
+    """
+    network = load_network(weights, device)
     if case.anatomy is not None and case.anatomy.landmark_names != network.anatomy.landmark_names:
         raise InputError(
             f"{case.folder}/case.yaml, anatomy: the network knows landmarks of the {network.anatomy.name}, not those "
@@ -66,6 +71,7 @@ def register(
     landmarks: Mapping[str, Tensor] | None = None,
     start: Mapping[str, Tensor] | None = None,
     camera_from_camera1: Tensor | None = None,
+    device: torch.device = CPU,
     report: Report = silent,
 ) -> Result:
     """Register a case by a plan, or by the preset or YAML file of that name.
@@ -73,7 +79,8 @@ def register(
     `start` has poses (4, 4) in camera 1 of objects by name, in place of how the case starts them. Objects that start
     from landmarks are placed by `landmarks`, pixels (2,) (column, row) in the first image by name, or by what `find`
     sees there, which is the shipped network if nothing is given. With `camera_from_camera1` (V, 4, 4) the C-arm's poses
-    are known and stay. Where a stage weighs pixels by the bones, `find` looks at every view.
+    are known and stay. Where a stage weighs pixels by the bones, `find` looks at every view. Volumes and images lie,
+    and are drawn and compared, on `device`.
     Raises `InputError` for input that does not fit.
     """
     scene = None
@@ -87,7 +94,9 @@ def register(
         for number, pose in enumerate(cameras):
             check_rigid(pose, f"camera_from_camera1[{number}]")
         scene = replace(prepare_scene(case), camera_from_camera1=cameras)
-    return register_scene(case, scene, plan, seed=seed, find=find, landmarks=landmarks, start=start, report=report)[0]
+    return register_scene(
+        case, scene, plan, seed=seed, find=find, landmarks=landmarks, start=start, device=device, report=report
+    )[0]
 
 
 def register_scene(
@@ -99,17 +108,28 @@ def register_scene(
     find: Detector | None = None,
     landmarks: Mapping[str, Tensor] | None = None,
     start: Mapping[str, Tensor] | None = None,
+    device: torch.device = CPU,
     report: Report = silent,
 ) -> tuple[Result, Scene]:
     """As `register`, from the scene of the case if it is there already; returns that as well."""
     plan = plan if isinstance(plan, Plan) else load_plan(plan)
     clock = {"began": time.perf_counter()}
     report("reading CT and images", 0.0)
-    scene = prepare_scene(case) if scene is None else scene
+    starts = {name: thing.start for name, thing in case.objects.items()}
+    if scene is not None:
+        starts = {name: thing.start for name, thing in scene.objects.items()}
+    placed = [name for name, begin in starts.items() if begin.by_landmarks and name not in (start or {})]
+    looks = plan.needs_segmentations or (bool(placed) and landmarks is None)
+    with ThreadPoolExecutor(max_workers=1) as beside:  # the network is read while the CT is
+        network = None
+        if looks and find is None and case.anatomy is not None:
+            network = beside.submit(network_detector, case, None, device)
+        scene = (prepare_scene(case) if scene is None else scene).to(device)
     if start is not None:
         scene = _started_at(scene, start)
     clock["prepared"] = time.perf_counter()
-    began, scene = _start(case, scene, plan, find, landmarks, report)
+    look = find if network is None else network.result()
+    began, scene = _start(case, scene, plan, look, landmarks, report)
     clock["started"] = time.perf_counter()
     anchor = began.camera1_from_object if scene.needs_landmarks else None
     outcome = run_plan(scene, plan, anchor, seed, report)
@@ -167,21 +187,19 @@ def _start(
     case: Case,
     scene: Scene,
     plan: Plan,
-    find: Detector | None,
+    look: Detector | None,
     landmarks: Mapping[str, Tensor] | None,
     report: Report,
 ) -> tuple[StartRecord, Scene]:
     """The pose that the objects are placed by, and the scene with what the network sees, if a stage asks for it."""
-    look = find
     seen = None
     if plan.needs_segmentations or (scene.needs_landmarks and landmarks is None):
-        if case.anatomy is None and find is None:
+        if look is None:
             raise InputError(
                 f"{case.folder}/case.yaml: no network knows the landmarks of {scene.anchor}. Name an `anatomy`, or "
                 "give the landmarks in the image (--landmarks) or a start pose (--start)."
             )
         report("finding landmarks", 0.0)
-        look = find or network_detector(case)
         seen = look_at(scene, 0, look)
     if not scene.needs_landmarks:
         began = StartRecord(scene.anchor, scene.start().camera1_from[scene.anchor], "poses that were given")

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -37,6 +37,10 @@ class RigidObject:
     parts: tuple[Volume, ...] = ()  # of a model, each of one material; on the grid of `volume`, which is their sum
     materials_known: bool = False  # whether materials were named; the HU of a single solid may be a guess
 
+    def to(self, device: torch.device) -> "RigidObject":
+        """The same with its volumes on a device."""
+        return replace(self, volume=self.volume.to(device), parts=tuple(part.to(device) for part in self.parts))
+
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
@@ -70,6 +74,29 @@ class Scene:
     outline: Outline | None = None  # what checks the start, in the space of `anchor`
     camera_from_camera1: Tensor | None = None  # (V, 4, 4) where the C-arm's poses are known and stay; None: to be found
     missing: tuple[str, ...] = ()  # what the case lacks and what shutters hide, in words
+
+    @property
+    def device(self) -> torch.device:
+        """Where volumes and images lie, and all that is drawn; poses and points lie on the CPU."""
+        return next(iter(self.objects.values())).volume.data.device
+
+    def to(self, device: torch.device) -> "Scene":
+        """The same with volumes and images on a device; the scene itself if they lie there."""
+        if device == self.device:
+            return self
+
+        def moved(images: dict[Kind, tuple[Tensor | None, ...]]) -> dict[Kind, tuple[Tensor | None, ...]]:
+            return {kind: tuple(None if one is None else one.to(device) for one in of) for kind, of in images.items()}
+
+        return replace(
+            self,
+            objects={name: thing.to(device) for name, thing in self.objects.items()},
+            images=moved(self.images),
+            fields=moved(self.fields),
+            segmentations=tuple(replace(s, probabilities=s.probabilities.to(device)) for s in self.segmentations),
+            tissue=None if self.tissue is None else self.tissue.to(device),
+            outline=None if self.outline is None else replace(self.outline, mask=self.outline.mask.to(device)),
+        )
 
     @property
     def first_kind(self) -> Kind:

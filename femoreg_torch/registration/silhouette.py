@@ -72,34 +72,36 @@ def refine_by_silhouette(
     the image; outside its exposed `field` (H, W), bool, and where it stands at its least or greatest value (shutters,
     saturation) nothing is compared, nor where the segmentation sees bones that may hide those of the outline.
     """
-    looked_at = _looked_at(seen, outline, anatomy, attenuation, camera, field)
-    target = seen.probabilities[list(anatomy.classes(outline.bones))].sum(0)[looked_at].double()
+    looked_at = _looked_at(seen, outline, anatomy, attenuation, camera, field).flatten().nonzero()[:, 0]
+    target = seen.probabilities[list(anatomy.classes(outline.bones))].sum(0).flatten()[looked_at].double()
     root = torch.linalg.cholesky(covariance.double())  # twist = root · u, with u of unit variance
 
     def poses(units: Tensor) -> Tensor:
         return about_point(exp_se3(units @ root.T), centre) @ camera_from_ct
 
     def seen_of(lengths: Tensor) -> Tensor:
-        return 1 - torch.exp(-lengths[..., looked_at].double() / _OPAQUE_MM)
+        return 1 - torch.exp(-lengths.flatten(-2)[..., looked_at].double() / _OPAQUE_MM)
 
     def drawn(units: Tensor) -> Tensor:
         return seen_of(project([outline.mask], poses(units)[:, None], seen.camera, _SPACING_MM))
 
     def values(units: Tensor) -> Tensor:
-        misfit = (drawn(units) - target).square().sum(1) / _PIXEL_DEVIATION**2
+        misfit = (drawn(units) - target).square().sum(1).cpu() / _PIXEL_DEVIATION**2
         return 0.5 * (misfit + units.square().sum(1))
 
     def quadratic(unit: Tensor) -> Quadratic:
         steps = _STEP * torch.eye(6, dtype=torch.float64)
         pose, above, below = poses(torch.cat([unit[None], unit + steps, unit - steps])).split([1, 6, 6])
-        twists = twist_rates((above - below) / (2 * _STEP), pose[0], centre)
+        twists = twist_rates((above - below) / (2 * _STEP), pose[0], centre).to(target.device, non_blocking=True)
         lengths, jacobian = project_with_jacobian(outline.mask, pose, seen.camera, centre, _SPACING_MM)
         here = seen_of(lengths[0])
-        by_unit = twists.T @ jacobian[0, looked_at].double().T  # (6, pixels)
+        by_unit = twists.T @ jacobian[0].flatten(0, 1)[looked_at].double().T  # (6, pixels)
         slopes = by_unit * (1 - here) / (_OPAQUE_MM * _PIXEL_DEVIATION)
         misfit = (here - target) / _PIXEL_DEVIATION
-        value = 0.5 * float(misfit @ misfit + unit @ unit)
-        return Quadratic(value, (slopes @ misfit + unit)[None], slopes @ slopes.T + torch.eye(6, dtype=torch.float64))
+        sums = torch.cat([(misfit @ misfit)[None], slopes @ misfit, (slopes @ slopes.T).flatten()]).cpu()
+        squared, gradient, hessian = sums.split([1, 6, 36])
+        value = 0.5 * float(squared[0] + unit @ unit)
+        return Quadratic(value, (gradient + unit)[None], hessian.view(6, 6) + torch.eye(6, dtype=torch.float64))
 
     best = _SEARCH.minimise(SmoothObjective(values, quadratic), 6, seed=0).delta
     inside = drawn(best[None])[0] > 0.5

@@ -123,7 +123,7 @@ def find_start(
         _check_rotation(pnp)
         return Start(pnp.camera_from_object, pnp, used, None)
     centre = transform_points(pnp.camera_from_object, points).mean(0)
-    bones = Segmentation(detection.segmentation, detection.network_camera)
+    bones = Segmentation(detection.segmentation.to(attenuation.device), detection.network_camera)
     fit = refine_by_silhouette(
         outline, anatomy, pnp.camera_from_object, centre, pnp.covariance, bones, attenuation, camera, field
     )
@@ -156,7 +156,7 @@ def look_at(scene: Scene, view: int, find: Detector) -> Detection:
 def with_segmentations(scene: Scene, first: Detection, find: Detector) -> Scene:
     """The scene with what the network sees of the bones in every view; `first` is what it saw in view 1."""
     others = [look_at(scene, view, find) for view in range(1, scene.views)]
-    seen = tuple(Segmentation(found.segmentation, found.network_camera) for found in (first, *others))
+    seen = tuple(Segmentation(found.segmentation.to(scene.device), found.network_camera) for found in (first, *others))
     return replace(scene, segmentations=seen)
 
 

@@ -48,7 +48,7 @@ def pixel_weights(
     if not weights:
         return None
     kind, view = image
-    looked_at = torch.ones(camera.shape, dtype=torch.bool)
+    looked_at = torch.ones(camera.shape, dtype=torch.bool, device=scene.device)
     if "bones" in weights:
         looked_at &= _bones(scene, poses, scene.shown(render, kind), view, camera, step_mm)
     if "clear" in weights:
@@ -96,14 +96,14 @@ def _on_grid(segmentation: Segmentation, camera: Camera) -> Tensor:
     """Probabilities (C, H, W) on the grid of another camera with the same detector; zero beyond the border."""
     pixels = project_points(segmentation.camera, camera.pixel_positions())
     size = torch.tensor(segmentation.camera.shape[::-1], dtype=torch.float64)
-    unit = ((2 * pixels + 1) / size - 1).to(segmentation.probabilities.dtype)  # pixel centres to grid_sample's −1 … 1
+    unit = ((2 * pixels + 1) / size - 1).to(segmentation.probabilities)  # pixel centres to grid_sample's −1 … 1
     return F.grid_sample(segmentation.probabilities[None], unit[None], align_corners=False)[0]
 
 
 def _silhouette(scene: Scene, poses: Poses, names: Sequence[str], view: int, camera: Camera, step_mm: float) -> Tensor:
     """The pixels (H, W) that the named objects cover at `poses`."""
     if not names:
-        return torch.zeros(camera.shape, dtype=torch.bool)
+        return torch.zeros(camera.shape, dtype=torch.bool, device=scene.device)
     where = torch.stack([poses.camera_from(name)[view] for name in names])[None]
     return project([scene.objects[name].volume for name in names], where, camera, step_mm)[0] > _LEAST_SHADOW
 

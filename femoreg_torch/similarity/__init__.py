@@ -11,7 +11,7 @@ from femoreg_torch.similarity.interface import (
 from femoreg_torch.similarity.kinds import read_similarity
 from femoreg_torch.similarity.ncc import Ncc
 from femoreg_torch.similarity.orientation import GradientOrientation
-from femoreg_torch.similarity.quadratic import similarity_quadratic
+from femoreg_torch.similarity.quadratic import similarity_quadratic, similarity_quadratics
 
 __all__ = [
     "FieldSimilarity",
@@ -24,4 +24,5 @@ __all__ = [
     "against_field",
     "read_similarity",
     "similarity_quadratic",
+    "similarity_quadratics",
 ]

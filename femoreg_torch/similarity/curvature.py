@@ -40,8 +40,8 @@ def patch_curvature(
     share = weights.flatten() / weights.sum() * ncc / spread
     total = sums(changes)  # Σ dm over each patch
     along = sums(changes * image) - total * mean  # Σ dm (m − mean)
-    grid = share.view(1, 1, *weights.shape)
-    pixels = F.conv_transpose2d(grid, image.new_ones(1, 1, side, side), stride=stride)[0, 0]
+    grid = share.view(1, 1, *weights.shape).to(torch.float64)  # or a GPU rounds it to ten bits
+    pixels = F.conv_transpose2d(grid, grid.new_ones(1, 1, side, side), stride=stride)[0, 0].to(image.dtype)
     pixels = F.pad(pixels, (0, image.shape[1] - pixels.shape[1], 0, image.shape[0] - pixels.shape[0]))
     flat = changes.flatten(1)
     matrix = (flat * pixels.flatten()) @ flat.T

@@ -79,14 +79,14 @@ class FixedGradNcc:
             value = self._reference(images)
         return 1 - value
 
-    def quadratic(self, image: Tensor, jacobian: Tensor) -> tuple[float, Tensor, Tensor]:
-        """Cost, scores (T, n) and Gauss–Newton hessian (n, n), see `SmoothFixedSimilarity`; the gradient is exact."""
+    def quadratic(self, image: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost (), scores (T, n), Gauss–Newton hessian (n, n), see `SmoothFixedSimilarity`; the gradient is exact."""
         moving = image[None].clone().requires_grad_()
         cost = self(moving)[0]
         (slope,) = torch.autograd.grad(cost, moving)
         changes = jacobian.movedim(-1, 0)  # (n, H, W)
         scores = tile_scores(changes, slope, _TILE * (2 * self.radius + 1))
-        return cost.item(), scores, self.curvature(image, changes, _STRIDE)
+        return cost.detach(), scores, self.curvature(image, changes, _STRIDE)
 
     def curvature(self, image: Tensor, changes: Tensor, stride: int) -> Tensor:
         """Gauss–Newton hessian (n, n) float64 about an image (H, W) with changes (n, H, W); every stride-th patch."""

@@ -15,8 +15,8 @@ class FixedSimilarity(Protocol):
 class SmoothFixedSimilarity(FixedSimilarity, Protocol):
     """One that knows its own derivatives of first and second order."""
 
-    def quadratic(self, image: Tensor, jacobian: Tensor) -> tuple[float, Tensor, Tensor]:
-        """Cost, scores (T, n) and a positive semi-definite hessian (n, n), float64, about an image (H, W).
+    def quadratic(self, image: Tensor, jacobian: Tensor) -> tuple[Tensor | float, Tensor, Tensor]:
+        """Cost (), scores (T, n) and a positive semi-definite hessian (n, n), float64, about an image (H, W).
 
         `jacobian` (H, W, n) holds the image's derivatives by n parameters. The scores are the gradient's parts from T
         tiles of the image, nearly independent of each other; their sum is the gradient.

@@ -7,6 +7,8 @@ differentiating twice, where J are the derivatives of the image I by the paramet
 Identifying and attacking the saddle point problem in high-dimensional non-convex optimization, NeurIPS 2014).
 """
 
+from collections.abc import Iterable, Sequence
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -21,11 +23,46 @@ _TILE_PX = 44  # edge of a tile; as that of Grad-NCC with patches of radius 5
 def similarity_quadratic(similarity: FixedSimilarity, image: Tensor, jacobian: Tensor) -> tuple[float, Tensor, Tensor]:
     """Cost, scores (T, n) and positive semi-definite hessian (n, n), float64, of a similarity about an image (H, W).
 
-    `jacobian` (H, W, n) holds the image's derivatives, see `SmoothFixedSimilarity`. Raises `InputError` for a
-    similarity that cannot be differentiated twice.
+    `jacobian` (H, W, n) holds the image's derivatives, see `SmoothFixedSimilarity`. Scores and hessian lie on the CPU,
+    wherever the image is. Raises `InputError` for a similarity that cannot be differentiated twice.
     """
-    if isinstance(similarity, SmoothFixedSimilarity):
-        return similarity.quadratic(image, jacobian)
+    return similarity_quadratics([(similarity, image, jacobian)])[0]
+
+
+def similarity_quadratics(
+    about: Iterable[tuple[FixedSimilarity, Tensor, Tensor]],
+) -> list[tuple[float, Tensor, Tensor]]:
+    """`similarity_quadratic` of several similarities, each with its image and jacobian; waits for a device once."""
+    similarities: list[FixedSimilarity] = []
+    found: list[tuple[Tensor | float, Tensor, Tensor]] = []
+    for similarity, image, jacobian in about:
+        similarities.append(similarity)
+        if isinstance(similarity, SmoothFixedSimilarity):
+            found.append(similarity.quadratic(image, jacobian))
+        else:
+            found.append(_differentiated(similarity, image, jacobian))
+    return [
+        (cost, scores, _checked(similarity, scores, hessian))
+        for similarity, (cost, scores, hessian) in zip(similarities, _on_the_cpu(found), strict=True)
+    ]
+
+
+def _on_the_cpu(found: Sequence[tuple[Tensor | float, Tensor, Tensor]]) -> list[tuple[float, Tensor, Tensor]]:
+    """Costs, scores and hessians there, all by one copy."""
+    if all(scores.device.type == hessian.device.type == "cpu" for _, scores, hessian in found):
+        return [(float(cost), scores, hessian) for cost, scores, hessian in found]
+    flat = []
+    for cost, scores, hessian in found:
+        flat += [scores.new_full((1,), cost) if isinstance(cost, float) else cost.reshape(1), scores, hessian]
+    parts = torch.cat([part.to(torch.float64).flatten() for part in flat]).cpu().split([part.numel() for part in flat])
+    return [
+        (float(cost), scores.view(there.shape), hessian.view(there.shape[1], -1))
+        for cost, scores, hessian, (_, there, _) in zip(parts[::3], parts[1::3], parts[2::3], found, strict=True)
+    ]
+
+
+def _differentiated(similarity: FixedSimilarity, image: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cost (), scores (T, n) and second derivatives (n, n) by differentiating a similarity twice."""
     moving = image[None].clone().requires_grad_()
     changes = jacobian.movedim(-1, 0)  # (n, H, W)
     try:
@@ -37,11 +74,21 @@ def similarity_quadratic(similarity: FixedSimilarity, image: Tensor, jacobian: T
         raise _not_smooth(similarity, " ".join(str(error).split())) from error
     scores = tile_scores(changes, slope.detach(), _TILE_PX)
     hessian = changes.flatten(1).to(torch.float64) @ torch.cat(bent).flatten(1).to(torch.float64).T
+    return cost.detach(), scores, hessian
+
+
+def _checked(similarity: FixedSimilarity, scores: Tensor, hessian: Tensor) -> Tensor:
+    """A hessian without negative curvature. Raises `InputError` for derivatives that are none.
+
+    A similarity that knows its own derivatives is believed.
+    """
+    if isinstance(similarity, SmoothFixedSimilarity):
+        return hessian
     if not (torch.isfinite(hessian).all() and torch.isfinite(scores).all()):
         raise _not_smooth(similarity, "its derivatives are not finite")
     if scores.any() and not hessian.any():
         raise _not_smooth(similarity, "its second derivative is zero")
-    return cost.item(), scores, _without_negative_curvature(hessian)
+    return _without_negative_curvature(hessian)
 
 
 def tile_scores(changes: Tensor, slope: Tensor, tile: int) -> Tensor:

@@ -41,6 +41,11 @@ class Volume:
             raise InputError(f"volume: {tuple(data.shape)} values do not fit a {tuple(self.data.shape)} grid.")
         return Volume(data, self.lps_from_index)
 
+    def to(self, device: torch.device) -> "Volume":
+        """The same with its values on a device; the volume itself if they lie there. The affine stays on the CPU."""
+        data = self.data.to(device)
+        return self if data is self.data else Volume(data, self.lps_from_index)
+
 
 def changes_in_place(data: Tensor) -> int:
     """How often a tensor was changed in place, for what is derived from it; 0 for one that does not count that.

@@ -5,12 +5,14 @@ It turns the first into zero, which as HU would be water, and fills the second u
 
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import nibabel
 import numpy as np
 
 from femoreg_torch.errors import InputError
+
+if TYPE_CHECKING:
+    import nibabel
 
 _SUFFIXES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz")
 
@@ -22,6 +24,8 @@ def check_nifti(path: Path) -> None:
     """
     if not path.name.lower().endswith(_SUFFIXES):
         return
+    import nibabel  # takes a tenth of a second, beside the reading of images
+
     try:
         image: Any = nibabel.load(path)  # its declared type is that of all formats, without voxels
         integers = image.get_data_dtype().kind not in "fc"
@@ -36,7 +40,7 @@ def check_nifti(path: Path) -> None:
         raise InputError(f"{path}: holds values that are not finite (NaN or infinite). Repair or export it anew.")
 
 
-def _whole(path: Path, data: nibabel.arrayproxy.ArrayProxy) -> bool:
+def _whole(path: Path, data: "nibabel.arrayproxy.ArrayProxy") -> bool:
     """Whether the last four bytes of a gzip file, its uncompressed size modulo 2³² (RFC 1952), are as `data` demands.
 
     False does not mean that the file is damaged: one of several gzip members tells the size of the last.

@@ -85,9 +85,9 @@ def scattered(primary: Tensor, model: XrayModel, camera: Camera, beam: Tensor) -
     """
     source = -primary * primary.clamp_min(1e-8).log() * beam
     coarse = max(1, round(model.scatter_sigma_mm / camera.pixel_mm[0] / 8))  # the field is smooth: 8 samples per sigma
-    small = torch.nn.functional.avg_pool2d(source[None, None], coarse, ceil_mode=True)[0, 0].numpy()
+    small = torch.nn.functional.avg_pool2d(source[None, None], coarse, ceil_mode=True)[0, 0].cpu().numpy()
     sigma = [model.scatter_sigma_mm / (spacing * coarse) for spacing in camera.pixel_mm]
-    field = torch.from_numpy(ndimage.gaussian_filter(small, sigma, mode="nearest"))
+    field = torch.from_numpy(ndimage.gaussian_filter(small, sigma, mode="nearest")).to(primary.device)
     size = list(primary.shape)
     wide = torch.nn.functional.interpolate(field[None, None], size=size, mode="bilinear", align_corners=False)[0, 0]
     return model.scatter * wide
@@ -111,9 +111,13 @@ def detect(energy: Tensor, model: XrayModel, camera: Camera, generator: torch.Ge
 
 
 def fluoroscopy(areal: Mapping[str, Tensor], camera: Camera, model: XrayModel, generator: torch.Generator) -> Tensor:
-    """Raw fluoroscopic image (H, W) uint16 behind the given mass per area (H, W) in g/cm² of each material."""
+    """Raw fluoroscopic image (H, W) uint16 behind the given mass per area (H, W) in g/cm² of each material.
+
+    The beam is attenuated where the masses lie, and detected on the CPU, where the image comes to.
+    """
     primary = transmission(areal, model)
     beam = open_beam(camera, model.inverse_square, model.heel, model.collimator_mm)
     if model.shutter_width_mm and model.shutter_height_mm:
         beam = beam * shutter(camera, model.shutter_width_mm, model.shutter_height_mm, model.shutter_deg)
-    return detect(beam * primary + scattered(primary, model, camera, beam), model, camera, generator)
+    beam = beam.to(primary.device)
+    return detect((beam * primary + scattered(primary, model, camera, beam)).cpu(), model, camera, generator)

@@ -25,6 +25,10 @@ class Solid:
     material: str
     density: Volume  # g/cm³
 
+    def to(self, device: torch.device) -> "Solid":
+        """The same with its density on a device."""
+        return replace(self, density=self.density.to(device))
+
 
 def areal_densities(
     densities: Mapping[str, Volume], camera_from_lps: Tensor, camera: Camera, step_mm: float

@@ -13,6 +13,7 @@ import torch
 from femoreg_torch.case import View, new_folder, read_case, write_case
 from femoreg_torch.case.femoroplasty import ANATOMY_IMAGES, DEVICE_IMAGES, with_device
 from femoreg_torch.case.model import Side
+from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import write_image
 from femoreg_torch.volume import Volume, label_box_centre, read_ct, read_label_map, read_labels, read_mesh
@@ -49,17 +50,18 @@ def write_simulation(
     config: str,
     report: Callable[[str], None],
     finer: Path | None = None,
+    device: torch.device = CPU,
 ) -> None:
     """Write the simulated acquisition of the patient in folder `patient` as a case in folder `out`.
 
     `side` is that of the patient's case.yaml, or left, where it is None; `config` is a preset or a YAML file. `report`
     is told each of `SIMULATION_STEPS` steps before it starts. `finer` is a folder with ct.nii.gz and labels.nii.gz of
     the same patient on finer voxels, if there is one: the images are then made from it, while the case holds the CT of
-    `patient`. Raises `InputError` before anything is written.
+    `patient`. Rays are cast on `device`. Raises `InputError` before anything is written.
     """
     known = read_case(patient).side if side is None and (patient / "case.yaml").is_file() else side
     scan = None if finer is None else partial(_read_pair, finer)
-    _write_simulation(patient, out, seed, known or "left", config, report, scan, seed)
+    _write_simulation(patient, out, seed, known or "left", config, report, scan, seed, device)
 
 
 def write_procedural_simulation(
@@ -102,6 +104,7 @@ def _write_simulation(
     report: Callable[[str], None],
     imaged: Callable[[], tuple[Volume, Volume]] | None,
     device_seed: int,
+    device: torch.device = CPU,
 ) -> None:
     settings = load_simulation(config)
     generator = torch.Generator().manual_seed(seed)
@@ -125,6 +128,7 @@ def _write_simulation(
             settings.xray,
             generator,
             report,
+            device,
         )
         report("writing")
         write_images_and_case(folder, known, images, procedure)

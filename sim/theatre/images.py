@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from femoreg_torch.drr import CPU
 from femoreg_torch.geometry import Camera, invert_rigid
 from femoreg_torch.volume import Volume
 from sim.physics.fluoroscopy import XrayModel, fluoroscopy
@@ -39,14 +40,19 @@ def simulate_images(
     model: XrayModel,
     generator: torch.Generator,
     report: Callable[[str], None],
+    device: torch.device = CPU,
 ) -> list[ViewImages]:
     """Images of all views of a procedure; `report` is told each step before it starts.
+
+    Line integrals and the attenuation of the beam are computed on `device`. Noise and detector are on the CPU, so that
+    a seed draws the same numbers everywhere.
 
     `ct` is in HU, `labels` on the same grid; `femur` holds the ids of the operated femur and `head_centre` (3,) is
     its head in LPS mm.
     """
     report("turning the femur")
-    tissue = posed_tissue(ct, labels, femur, head_centre, procedure, camera)
+    tissue = posed_tissue(ct, labels, femur, head_centre, procedure, camera).to(device)
+    metal = metal.to(device)
     del ct, labels
 
     def body(pose: Tensor) -> dict[str, Tensor]:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 import trimesh
 
 from femoreg_torch.errors import InputError
@@ -21,6 +22,10 @@ class Metal:
 
     device: list[Solid]  # in CAD space
     table: list[Solid]  # in the frame of camera 1
+
+    def to(self, device: torch.device) -> "Metal":
+        """The same with its densities on a device."""
+        return Metal([solid.to(device) for solid in self.device], [solid.to(device) for solid in self.table])
 
 
 def draw_materials(seed: int) -> dict[str, str]:

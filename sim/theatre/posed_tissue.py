@@ -26,6 +26,10 @@ class PosedTissue:
     lps_from_femur: Tensor  # (4, 4): the turn, LPS mm
     apart: tuple[Volume, ...] = ()  # bones at rest that were to be held apart
 
+    def to(self, device: torch.device) -> "PosedTissue":
+        """The same with its densities on a device."""
+        return PosedTissue(self.filled.to(device), self.bone.to(device), self.femur.to(device), self.lps_from_femur)
+
 
 def take_apart(
     ct: Volume,
