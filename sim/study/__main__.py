@@ -14,6 +14,7 @@ from femoreg_torch.registration import load_plan
 from sim.study import ablation as variants
 from sim.study import accuracy as measurement
 from sim.study import capture
+from sim.study.cadaver import cadaver
 from sim.study.cases import Stores, ready
 from sim.study.conditions import Imaged, make_conditions, read_conditions
 from sim.study.conditions_page import write_conditions
@@ -256,6 +257,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "trust": trust,
         "ablation": ablation,
         "conditions": conditions,
+        "cadaver": cadaver,
         "list": listing,
     }
     try:
