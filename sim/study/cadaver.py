@@ -44,12 +44,11 @@ from femoreg_torch.evaluation import errors
 from femoreg_torch.files import read_json, temporary_file, write_json, write_text
 from femoreg_torch.geometry import Poses, project_points, transform_points
 from femoreg_torch.settings import read_record
-from femoreg_torch.statistics.formats import plus_minus
+from femoreg_torch.statistics.formats import pipe_table, plus_minus
 from femoreg_torch.statistics.quantities import METRICS, PAPER_TRIALS
 from femoreg_torch.volume import Volume, read_ct, read_mesh, write_landmarks, write_volume
 from sim.patient import make_scans
 from sim.physics.line_integrals import together
-from sim.study.page import table
 from sim.theatre.beads import PlacedBeads, ct_with_beads, device_beads, femur_beads
 from sim.theatre.case_folders import copied, write_images_and_case, write_patient_case
 from sim.theatre.images import posed_tissue, view_images
@@ -313,7 +312,7 @@ def _error_table(records: dict[str, dict[str, Any]]) -> str:
         paper = PAPER_TRIALS[key]
         shown = [f"{value:.2f}" for value in paper] if len(paper) == len(records) else [""] * len(records)
         rows.append([f"{title}, paper", *shown, _mean(paper), "–"])
-    return table(["simulated trial", *records, "mean ± SD", "truth's own, rms"], rows)
+    return pipe_table(["simulated trial", *records, "mean ± SD", "truth's own, rms"], rows)
 
 
 def _truth_table(records: dict[str, dict[str, Any]]) -> str:
@@ -326,7 +325,7 @@ def _truth_table(records: dict[str, dict[str, Any]]) -> str:
         for key, title in NAMES.items():
             values = [record["truth_errors"][truth][key] for record in records.values()]
             rows.append([f"{truth}: {title}", *(f"{v:.2f}" for v in values), _mean(values)])
-    return table(["error of the truth itself", *records, "mean ± SD"], rows)
+    return pipe_table(["error of the truth itself", *records, "mean ± SD"], rows)
 
 
 def _mean(values: list[float]) -> str:

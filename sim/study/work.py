@@ -26,9 +26,9 @@ from sim.study.conditions import Body, make_case, simulation_of
 from sim.study.detections import DetectionNoise, simulated_detector
 from sim.study.procedures import Procedure
 from sim.study.protocol import Protocol, Variation
+from sim.study.record import Record
 from sim.study.starts import displaced
 from sim.study.store import Run
-from sim.study.summary import Record
 from sim.study.trial import first_views, register_case
 from sim.theatre.settings import Simulation
 
