@@ -235,7 +235,7 @@ def conditions(
     """
     every = _chosen(conditions_file, preset, first, kind, out, patients, data)
     settings = only_these(every.settings, only.split(",") if only else (), f"conditions {conditions_file}")
-    chosen = replace(every, settings=settings, imaged=replace(every.imaged, bodies=out / "bodies"))
+    chosen = replace(every, settings=settings, imaged=replace(every.imaged, bodies=(out / "bodies").resolve()))
     if cases_only:
         _make_cases(chosen, jobs)
         return DONE

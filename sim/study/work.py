@@ -61,11 +61,12 @@ class Setting:
 def settings_of(protocol: Protocol, name: str) -> dict[str, Setting]:
     """The conditions of a protocol by name. Raises `InputError` for a preset that is not there or does not fit."""
     base = load_preset("simulation", protocol.simulation)
+    plans = {preset: load_plan(preset) for preset in {v.preset or protocol.preset for v in protocol.vary}}
     found = {}
     for variation in protocol.vary:
         where = f"study {name}, {variation.name}"
         read_record(Simulation, simulation_of(variation, base), where)
-        plan = load_plan(variation.preset or protocol.preset)
+        plan = plans[variation.preset or protocol.preset]
         detections = variation.detections or protocol.detections
         found[variation.name] = Setting(variation, plan, base, detections, protocol.closed_loop)
     return found
