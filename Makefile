@@ -37,8 +37,8 @@ bench-gpu: setup
 	$(BIN)/python benchmarks/drr.py --device cuda
 	$(BIN)/python benchmarks/scaling.py --device cuda
 
-# Studies on simulated procedures; they renew docs/accuracy.md. Made once, the procedures stay in out/accuracy. The real bone
-# shapes are looked for in the folder FEMOREG_DATA.
+# Studies on simulated procedures; they renew docs/accuracy.md. Made once, the procedures stay in out/accuracy, and so do
+# runs. The real bone shapes are looked for in the folder FEMOREG_DATA.
 PRESET ?= fast
 JOBS ?= 1
 TIMED ?= 5

@@ -11,6 +11,7 @@ _EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
     "distributed": "study",
     "joblib": "study",
     "pandas": "study",
+    "psutil": "study",
     "pyamg": "plan",
     "meshio": "plan",
     "pyarrow": "all",  # in both `study` and `plan`

@@ -183,49 +183,19 @@ def study(
         reuse: Take runs that are there although the code has changed since.
     """
     from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
-    from femoreg_torch.commands.status import AMISS, DONE
     from femoreg_torch.errors import InputError
     from sim.study.engine import Executor
     from sim.study.executors import OnCluster, OnThisMachine
-    from sim.study.study import RECORDED, plan_study, run_study
+    from sim.study.study import plan_study
+    from sim.study.telling import carry_out_told
 
     if jobs < 1:
         raise InputError(f"--jobs: at least 1 was expected, got {jobs}.")
-    console = Console()
-    with console.status("reading the protocol"):
+    with Console().status("reading the protocol"):
         plan = plan_study(config, procedures, out.resolve(), data, keep_cases)
     executor: Executor = OnThisMachine(jobs) if scheduler is None else OnCluster(scheduler)
-    bar = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left:"), TimeRemainingColumn())
-    with Progress(TextColumn("runs"), *bar, console=console, speed_estimate_period=3600) as progress:
-        task = progress.add_task("runs", total=len(plan.runs))
-
-        def begin(todo: int, kept: int, others: int) -> None:
-            progress.update(task, total=todo)
-            if kept:
-                console.print(f"{kept} of {kept + todo} runs are there already.")
-            if others:
-                console.print(
-                    f"{others} records of other settings or procedures stay in {out / 'runs'}, out of the table."
-                )
-
-        told = run_study(plan, out, executor, reuse, begin, lambda done: progress.advance(task, done))
-    counts = ", ".join(f"{count} {status}" for status, count in sorted(told.status.items()))
-    what = "Runs on recorded cases" if all(run.kind == RECORDED for run in plan.runs) else "Simulated runs"
-    console.print(f"{what}: {counts}; of those done, {told.flagged} are not trusted.")
-    if told.first_failure is not None:
-        console.print(f"[bold red]Failed[/], first of them: {escape(told.first_failure)}")
-    console.print(f"Table written to {told.table}.", markup=False)
-    return AMISS if told.first_failure is not None else DONE
+    return carry_out_told(plan, out, executor, reuse)
 
 
 def demo(*, out: Path = Path("out/demo"), seed: int = 1, preset: str = "fast") -> None:

@@ -12,7 +12,9 @@ from lightning.pytorch.callbacks import (
     EarlyStopping,
     EMAWeightAveraging,
     ModelCheckpoint,
+    ProgressBar,
     RichProgressBar,
+    TQDMProgressBar,
 )
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from rich.console import Console
@@ -94,7 +96,7 @@ def train_network(
         enable_version_counter=False,
     )
     callbacks: list[Callback] = [best, EMAWeightAveraging(decay=optimisation.averaging), Pictures()]
-    callbacks.append(RichProgressBar(refresh_rate=25))
+    callbacks.append(progress_bar(console))
     if cohort.validation and optimisation.patience:
         callbacks.append(EarlyStopping(_MONITORED, patience=optimisation.patience))
     trainer = Trainer(
@@ -116,6 +118,11 @@ def train_network(
         return out / SHIPPED_WEIGHTS
     draw_curves(out / "tensorboard", out / "curves.png")
     return export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
+
+
+def progress_bar(console: Console) -> ProgressBar:
+    """Lightning's bar for a terminal; in a Jupyter notebook, where that one fails, the plain one."""
+    return TQDMProgressBar(refresh_rate=25) if console.is_jupyter else RichProgressBar(refresh_rate=25)
 
 
 def begin_with(path: Path, network: nn.Module) -> None:

@@ -7,7 +7,7 @@ from femoreg_torch.beads.matching import Match, match_beads
 from femoreg_torch.beads.measure import Measured, measure
 from femoreg_torch.beads.model import Beads, check_beads
 from femoreg_torch.beads.spots import Spots, find_spots
-from femoreg_torch.beads.table import Trial, read_trials, table_three, write_rows
+from femoreg_torch.beads.trials import Trial, read_trials
 from femoreg_torch.beads.uncertainty import Uncertainty, metric_deviations, object_rows, pose_uncertainty
 from femoreg_torch.beads.writing import UNCERTAINTY_NAME, bead_points, uncertainty_content, write_measured
 
@@ -35,8 +35,6 @@ __all__ = [
     "pose_uncertainty",
     "read_beads",
     "read_trials",
-    "table_three",
     "uncertainty_content",
     "write_measured",
-    "write_rows",
 ]

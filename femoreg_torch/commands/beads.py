@@ -57,26 +57,27 @@ def beads(case: Path, *, beads: Path, out: Path, run: Path | None = None) -> Non
     console.print(f"The case without beads, and its truth: {escape(str(out))}")
 
 
-def beads_table(trials: Path, *, run: str = "run", out: Path | None = None) -> None:
+def beads_table(trials: Path, *, run: str = "run") -> None:
     """Tell the errors of registrations against beads, as the paper's Table III and beside it.
 
     Every trial is a folder that `femoreg beads` wrote, with the result of its registration inside:
     `femoreg register TRIALS/I --out TRIALS/I/run`. Below each error stands what the beads themselves leave open of it.
-    A star marks a registration that does not trust itself.
+    A star marks a registration that does not trust itself. The rows are written to TRIALS/trials.parquet, which
+    `femoreg tables TRIALS` turns into files for a paper.
 
     Args:
         trials: Folder of the trials' folders.
         run: Name of the folder in each trial that holds its result.
-        out: CSV file for the rows, one per trial.
     """
     from rich.console import Console
-    from rich.markup import escape
 
-    from femoreg_torch.beads import read_trials, table_three, write_rows
+    from femoreg_torch.beads import read_trials
+    from femoreg_torch.statistics.formats import for_terminal
+    from femoreg_torch.statistics.rows import TRIALS_NAME, write_rows
+    from femoreg_torch.statistics.trials import rows_of_trials, trial_table
 
+    rows = rows_of_trials(read_trials(trials, run), trials.resolve().name)
+    write_rows(rows, trials / TRIALS_NAME)
     console = Console()
-    found = read_trials(trials, run)
-    console.print(table_three(found))
-    if out is not None:
-        write_rows(out, found)
-        console.print(f"Rows: {escape(str(out))}")
+    console.print(for_terminal(trial_table(rows)))
+    console.print(f"Rows: {trials / TRIALS_NAME}", markup=False, highlight=False, soft_wrap=True)

@@ -1,7 +1,7 @@
 """One table, and its ways to be written: Markdown, CSV, LaTeX, HTML, and for the terminal."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -63,11 +63,16 @@ def percent(share: float) -> str:
     return "–" if math.isnan(share) else f"{100 * share:.1f} %"
 
 
+def pipe_table(columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:
+    """The lines of a Markdown table, its first `texts` columns to the left, all others to the right."""
+    lines = [columns, ["---" if n < texts else "---:" for n in range(len(columns))]]
+    cells = [[cell.replace("|", "\\|") for cell in line] for line in (*lines, *rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
 def markdown(table: Table) -> str:
     """As a Markdown table, with title and note."""
-    lines = [table.columns, tuple("---" if n < table.texts else "---:" for n in range(len(table.columns)))]
-    cells = [[cell.replace("|", "\\|") for cell in line] for line in (*lines, *table.rows)]
-    body = "\n".join(f"| {' | '.join(line)} |" for line in cells)
+    body = pipe_table(table.columns, table.rows, table.texts)
     return "\n\n".join(part for part in (f"**{table.title}**", body, table.note) if part) + "\n"
 
 

@@ -23,6 +23,7 @@ DONE, REFUSED, FAILED = "done", "refused", "failed"
 VARIED, SECONDS, EVALUATIONS, VERSION = "varied_", "seconds_", "evaluations_", "version_"  # how names of columns start
 ASKED = "asked"  # optional: the objects that the images show, apart by blanks
 ROUND = "round"  # optional: of a closed loop, from 1
+BEADS = "beads_"  # optional, of trials: what the beads themselves leave open of the error whose name follows
 ALL = "all"  # what the group of all conditions is called
 
 SIGMAS = tuple(f"{name}_sigma_{unit}_{axis}" for name in OBJECTS for unit in ("mm", "deg") for axis in AXES)
@@ -34,7 +35,8 @@ ROUNDS = (
     "left_deg",
 )  # guide from path, before and after a round
 _PARTS = tuple(f"{point}_mm_{axis}" for point in ("entry_point", "tip") for axis in AXES)  # optional
-NUMBERS = (*_SIGNED, *(q.column for q in METRICS), *_PARTS, *SIGMAS, PELVIS_AT_HEAD, *ROUNDS)
+_OPEN = tuple(BEADS + q.column for q in METRICS)
+NUMBERS = (*_SIGNED, *(q.column for q in METRICS), *_PARTS, *SIGMAS, PELVIS_AT_HEAD, *ROUNDS, *_OPEN)
 _NOT_TEXT = ("number", "seed", "trusted")
 
 

@@ -2,25 +2,35 @@
 
 import os
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import pandas as pd
 from jsonargparse import auto_cli
 
+from femoreg_torch.commands.status import BAD_INPUT, DONE
 from femoreg_torch.errors import InputError
 from femoreg_torch.registration import load_plan
+from femoreg_torch.statistics.study import read_study
 from sim.study import ablation as variants
-from sim.study import accuracy as measurement
 from sim.study import capture
-from sim.study.cases import Stores, ready
-from sim.study.conditions import Imaged, make_conditions, read_conditions
+from sim.study.accuracy_page import write_results
+from sim.study.cadaver import cadaver
+from sim.study.cases import Stores
+from sim.study.conditions import Imaged, is_made, make_conditions
 from sim.study.conditions_page import write_conditions
+from sim.study.executors import OnThisMachine
 from sim.study.limits import limits as limits_of
-from sim.study.procedures import Procedure, Study, load_study, procedures
+from sim.study.procedures import Procedure
+from sim.study.protocol import Protocol, load_protocol
+from sim.study.store import Run
+from sim.study.telling import carry_out_told
 from sim.study.timing import time_register
-from sim.study.trust import sabotaged_runs, write_trust
+from sim.study.trust import plan_trust, write_trust
+from sim.study.work import Setting, settings_of
+from sim.study.yardsticks import only_these, plan_yardstick, take_earlier
 
 _DATA = Path(os.environ.get("FEMOREG_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 _OUT = Path("out/accuracy")
@@ -34,19 +44,19 @@ def cases(
     patients: Path | None = None,
     data: Path = _DATA,
     jobs: int = 1,
-) -> None:
+) -> int:
     """Make the simulated procedures, and keep them; those that are there stay as they are.
 
     Args:
         first: only the first so many.
         kind: patients to take.
-        out: folder that holds, or will hold, `cases/`.
+        out: folder that holds, or will hold, `conditions/uniform/`.
         patients: CTs around real bone shapes; OUT/patients if not given.
         data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
         jobs: cases made at the same time, on one core each; a case needs some gigabytes of memory.
     """
-    study, chosen, stores = _chosen(first, kind, out, patients, data)
-    measurement.make_cases(chosen, study, stores, jobs)
+    _make_cases(_chosen("accuracy", "fast", first, kind, out, patients, data), jobs)
+    return DONE
 
 
 def accuracy(
@@ -60,8 +70,11 @@ def accuracy(
     reuse: bool = False,
     timed: int = 0,
     docs: Path | None = None,
-) -> None:
+) -> int:
     """Register the simulated procedures, making those that are missing, and tell the errors.
+
+    Runs are kept in OUT/PRESET as `femoreg study` keeps them: started again, the command goes on with those that are
+    missing. Status 1 if a run failed.
 
     Args:
         preset: registration preset.
@@ -70,19 +83,21 @@ def accuracy(
         out: folder of cases and results.
         patients: CTs around real bone shapes; OUT/patients if not given.
         data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
-        jobs: registrations at the same time, on one core each; one alone may use all cores.
+        jobs: procedures at the same time, on one core each; each needs some gigabytes of memory.
         reuse: take results that are there although code or plan have changed since (those of the same code always are).
         timed: time the whole command `femoreg register` on so many of the procedures, one after the other.
         docs: folder of the page that is to be renewed.
     """
     first = 20 if first is None and preset == "paper" else first
-    study, chosen, stores = _chosen(first, kind, out, patients, data)
-    measurement.make_cases(chosen, study, stores, jobs)
-    plan = load_plan(preset)
+    chosen = _chosen("accuracy", preset, first, kind, out, patients, data)
     folder = out / preset
-    records = measurement.register_all(chosen, study, stores, plan, folder / "runs", jobs, reuse)
-    timing = time_register([stores.case(p) for p in chosen[:timed]], preset) if timed else None
-    print(measurement.write_results(records, len(procedures(study)), preset, folder, docs, timing))
+    status, rows = _carried_out(
+        "accuracy", chosen, chosen.settings, folder, jobs, reuse, lambda run: folder / "runs" / _earlier_name(run)
+    )
+    timing = time_register(chosen.cases()[:timed], preset) if timed else None
+    total = len(chosen.protocol.first(chosen.protocol.procedures, real=True))
+    print(write_results(rows, total, preset, folder, docs, timing))
+    return status
 
 
 def capture_range(
@@ -94,7 +109,7 @@ def capture_range(
     patients: Path | None = None,
     data: Path = _DATA,
     docs: Path | None = None,
-) -> None:
+) -> int:
     """Success of the pelvis stages in view 1 against the offset of the start.
 
     Args:
@@ -107,11 +122,12 @@ def capture_range(
         data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
         docs: folder of the page that is to be renewed.
     """
-    study, chosen, stores = _chosen(first, kind, out, patients, data)
-    measurement.make_cases(chosen, study, stores, 1)
+    chosen = _chosen("accuracy", preset, first, kind, out, patients, data)
+    _make_cases(chosen, 1)
     plan = load_plan(preset)
-    records = capture.sweep_starts([stores.case(p) for p in chosen], plan, starts)
+    records = capture.sweep_starts(chosen.cases(), plan, starts)
     print(capture.write_capture(records, plan, out / "capture", docs))
+    return DONE
 
 
 def trust(
@@ -122,9 +138,10 @@ def trust(
     out: Path = _OUT,
     patients: Path | None = None,
     data: Path = _DATA,
+    jobs: int = 1,
     docs: Path | None = None,
-) -> None:
-    """Whole runs from starts that are meant to go wrong, and whether they say so.
+) -> int:
+    """Whole runs from starts that are meant to go wrong, and whether they say so; kept in OUT/trust_PRESET.
 
     Args:
         preset: registration preset.
@@ -134,12 +151,17 @@ def trust(
         out: folder of cases and results.
         patients: CTs around real bone shapes; OUT/patients if not given.
         data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
+        jobs: procedures at the same time, on one core each.
         docs: folder of the page that is to be renewed.
     """
-    study, chosen, stores = _chosen(first, kind, out, patients, data)
-    measurement.make_cases(chosen, study, stores, 1)
-    records = sabotaged_runs([stores.case(p) for p in chosen], load_plan(preset), starts)
-    print(write_trust(records, preset, out / "trust", docs))
+    chosen = _chosen("accuracy", preset, first, kind, out, patients, data)
+    _make_cases(chosen, jobs)
+    folder = out / f"trust_{preset}"
+    (setting,) = chosen.settings.values()
+    study = plan_trust(setting, chosen.procedures, chosen.stores, chosen.imaged, starts)
+    status = carry_out_told(study, folder, OnThisMachine(jobs), reuse=False)
+    print(write_trust(read_study(folder), preset, docs))
+    return status
 
 
 def ablation(
@@ -151,8 +173,8 @@ def ablation(
     data: Path = _DATA,
     jobs: int = 1,
     docs: Path | None = None,
-) -> None:
-    """Variants of a plan on the same procedures, in one table.
+) -> int:
+    """Variants of a plan on the same procedures, in one table; kept in OUT/ablation.
 
     Args:
         variants_file: preset of configs/study, or a YAML file of variants.
@@ -161,19 +183,22 @@ def ablation(
         out: folder of cases and results.
         patients: CTs around real bone shapes; OUT/patients if not given.
         data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
-        jobs: registrations at the same time, on one core each.
+        jobs: procedures at the same time, on one core each.
         docs: folder of the page that is to be renewed.
     """
-    study, chosen, stores = _chosen(first, kind, out, patients, data)
-    measurement.make_cases(chosen, study, stores, jobs)
-    rows = []
-    for variant in variants.read_variants(variants_file):
-        runs = out / "ablation" / variant.name.replace(" ", "_")
-        plan = variants.plan_of(variant)
-        print(variant.name, flush=True)
-        records = measurement.register_all(chosen, study, stores, plan, runs, jobs, views=variant.views)
-        rows.append(variants.row_of(variant, records))
-    print(variants.write_ablation(rows, len(chosen), variants_file, docs))
+    chosen = _chosen("accuracy", "fast", first, kind, out, patients, data)
+    (usual,) = chosen.settings.values()
+    listed = variants.read_variants(variants_file)
+    settings = {
+        variant.condition: replace(
+            usual, plan=variants.plan_of(variant), variation=replace(usual.variation, views=variant.views)
+        )
+        for variant in listed
+    }
+    status, rows = _carried_out("ablation", chosen, settings, out / "ablation", jobs)
+    lines = [variants.row_of(variant, rows[rows["condition"].eq(variant.condition)]) for variant in listed]
+    print(variants.write_ablation(lines, len(chosen.procedures), variants_file, docs))
+    return status
 
 
 def conditions(
@@ -189,13 +214,14 @@ def conditions(
     cases_only: bool = False,
     reuse: bool = False,
     docs: Path | None = None,
-) -> None:
+) -> int:
     """Image the procedures under other conditions, register them, and tell the errors under each.
 
-    Cases stand in OUT/conditions/CONDITION/PROCEDURE; those that are there stay.
+    Cases stand in OUT/conditions/CONDITION/PROCEDURE; those that are there stay. Runs are kept in
+    OUT/PRESET_conditions as `femoreg study` keeps them. Status 1 if a run failed.
 
     Args:
-        conditions_file: preset of configs/study, or a YAML file of conditions.
+        conditions_file: protocol of configs/study, or a YAML file.
         only: names of conditions, with commas in between; all, if not given.
         preset: registration preset.
         first: only the first so many procedures.
@@ -208,23 +234,21 @@ def conditions(
         reuse: take results that are there although code or plan have changed since (those of the same code always are).
         docs: folder of the page that is to be renewed.
     """
-    study, chosen, stores = _chosen(first, kind, out, patients, data)
-    wanted = read_conditions(conditions_file, only.split(",") if only else ())
-    imaged = Imaged(out / "bodies", out / "conditions")
-    make_conditions(chosen, wanted, study, stores, imaged, jobs)
+    every = _chosen(conditions_file, preset, first, kind, out, patients, data)
+    settings = only_these(every.settings, only.split(",") if only else (), f"conditions {conditions_file}")
+    chosen = replace(every, settings=settings, imaged=replace(every.imaged, bodies=(out / "bodies").resolve()))
     if cases_only:
-        return
-    plan = load_plan(preset)
+        _make_cases(chosen, jobs)
+        return DONE
     folder = out / f"{preset}_conditions"
-    runs = []
-    for condition in wanted:
-        print(condition.name, flush=True)
-        cases = replace(stores, cases=imaged.conditions / condition.name)
-        records = measurement.register_all(chosen, study, cases, plan, folder / condition.name / "runs", jobs, reuse)
-        runs.append((condition, records))
-    command = f"python -m sim.study conditions --preset {preset} --first {len(chosen)}"
+    name = Path(conditions_file).stem
+    status, rows = _carried_out(
+        name, chosen, settings, folder, jobs, reuse, lambda run: folder / run.condition / "runs" / _earlier_name(run)
+    )
+    command = f"python -m sim.study conditions --preset {preset} --first {len(chosen.procedures)}"
     command += f" --only {only}" if only else ""
-    print(write_conditions(runs, preset, first, command, folder, docs))
+    print(write_conditions(rows, list(settings), preset, first, command, docs))
+    return status
 
 
 def limits(
@@ -234,7 +258,7 @@ def limits(
     first: int = 6,
     noise_alone: int = 0,
     pixel_mm: float = 0.78,
-) -> None:
+) -> int:
     """Tell how far a study's errors are from what its images allow: Cramér–Rao bounds, and what each image is worth.
 
     Procedures are made anew from their seeds, a minute or so each on one core, and images are not. The bounds go to
@@ -251,9 +275,10 @@ def limits(
     """
     path = limits_of(protocol, study, first, pixel_mm, condition, noise_alone, lambda what: print(what, flush=True))
     print(f"Bounds: {path}. `femoreg tables {study}` tells them.")
+    return DONE
 
 
-def listing(first: int | None = None, kind: Kind = "all", out: Path = _OUT) -> None:
+def listing(first: int | None = None, kind: Kind = "all", out: Path = _OUT) -> int:
     """Which procedures the study has, and which of their cases are there.
 
     Args:
@@ -261,17 +286,66 @@ def listing(first: int | None = None, kind: Kind = "all", out: Path = _OUT) -> N
         kind: patients to take.
         out: folder of cases.
     """
-    study, chosen, stores = _chosen(first, kind, out, None, _DATA)
-    for procedure in chosen:
-        print(f"{'ready' if ready(procedure, study, stores) else '-----'}  {stores.case(procedure)}")
+    chosen = _chosen("accuracy", "fast", first, kind, out, None, _DATA)
+    (setting,) = chosen.settings.values()
+    for procedure, folder in zip(chosen.procedures, chosen.cases(), strict=True):
+        made = is_made(setting.variation, procedure, setting.simulation, chosen.imaged)
+        print(f"{'ready' if made else '-----'}  {folder}")
+    return DONE
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """Procedures of a protocol, the settings of its conditions by name, and the folders of what is kept."""
+
+    protocol: Protocol
+    settings: Mapping[str, Setting]
+    procedures: list[Procedure]
+    stores: Stores
+    imaged: Imaged
+
+    def cases(self) -> list[Path]:
+        """The case folders of the first condition."""
+        setting = next(iter(self.settings.values()))
+        return [self.imaged.case(setting.variation, procedure) for procedure in self.procedures]
 
 
 def _chosen(
-    first: int | None, kind: Kind, out: Path, patients: Path | None, data: Path
-) -> tuple[Study, list[Procedure], Stores]:
-    study = load_study("accuracy")
-    fitting = [p for p in procedures(study) if kind in ("all", "procedural" if p.procedural else "real")]
-    return study, fitting[:first], Stores(out / "cases", patients or out / "patients", data)
+    name: str, preset: str, first: int | None, kind: Kind, out: Path, patients: Path | None, data: Path
+) -> _Chosen:
+    protocol = replace(load_protocol(name), preset=preset)
+    every = protocol.first(protocol.procedures, real=True)
+    fitting = [p for p in every if kind in ("all", "procedural" if p.procedural else "real")]
+    stores = Stores(out / "cases", (patients or out / "patients").resolve(), data.resolve())
+    imaged = Imaged(None, (out / "conditions").resolve())
+    return _Chosen(protocol, settings_of(protocol, name), fitting[:first], stores, imaged)
+
+
+def _make_cases(chosen: _Chosen, jobs: int) -> None:
+    settings = list(chosen.settings.values())
+    variations = [setting.variation for setting in settings]
+    make_conditions(chosen.procedures, variations, settings[0].simulation, chosen.stores, chosen.imaged, jobs)
+
+
+def _carried_out(
+    name: str,
+    chosen: _Chosen,
+    settings: Mapping[str, Setting],
+    folder: Path,
+    jobs: int,
+    reuse: bool = False,
+    earlier: Callable[[Run], Path] | None = None,
+) -> tuple[int, pd.DataFrame]:
+    """Make the runs that are missing. Returns the exit status and the rows of all; `earlier` see `take_earlier`."""
+    study = plan_yardstick(name, chosen.protocol, settings, chosen.procedures, chosen.stores, chosen.imaged, folder)
+    if reuse and earlier is not None and (taken := take_earlier(study, folder, earlier)):
+        print(f"{taken} records of versions before the engine are taken over.")
+    status = carry_out_told(study, folder, OnThisMachine(jobs), reuse)
+    return status, read_study(folder)
+
+
+def _earlier_name(run: Run) -> str:
+    return f"{run.procedure.name}.json"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -284,14 +358,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "ablation": ablation,
         "conditions": conditions,
         "limits": limits,
+        "cadaver": cadaver,
         "list": listing,
     }
     try:
-        auto_cli(commands, args=None if arguments is None else list(arguments), as_positional=False)
+        status = auto_cli(commands, args=None if arguments is None else list(arguments), as_positional=False)
     except InputError as error:
         print(f"sim.study: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    return 0
+        return BAD_INPUT
+    return int(status or DONE)
 
 
 if __name__ == "__main__":

@@ -5,15 +5,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from femoreg_torch.configs import load_preset
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.registration import Plan
 from femoreg_torch.registration.plan import plan_from
 from femoreg_torch.settings import read_record
-from sim.study.page import machine, number, table, write_section
-from sim.study.quantities import QUANTITIES
-from sim.study.summary import Record, confusion, relative_is_wrong, statistics
+from femoreg_torch.statistics.costs import stage_costs
+from femoreg_torch.statistics.formats import number, pipe_table
+from femoreg_torch.statistics.outcome import WRONG_MM
+from femoreg_torch.statistics.quantities import QUANTITIES, RELATIVE
+from femoreg_torch.statistics.rows import SECONDS, folder_name
+from femoreg_torch.statistics.summary import confusion, statistics, within
+from sim.study.page import machine, write_section
 
 _ANY = "*"
 
@@ -27,6 +32,11 @@ class Variant:
     without: list[str] = field(default_factory=list)  # names of steps
     change: dict[str, dict[str, Any]] = field(default_factory=dict)  # of a step: keys with new values; * for any step
     views: int | None = None  # the first so many; all if None
+
+    @property
+    def condition(self) -> str:
+        """Its name as a study's condition, which is part of file names."""
+        return folder_name(self.name)
 
 
 @dataclass(frozen=True)
@@ -69,23 +79,22 @@ def _changed(step: dict[str, Any], change: dict[str, dict[str, Any]]) -> dict[st
     return {key: value for key, value in (step | new).items() if value is not None}
 
 
-def row_of(variant: Variant, records: Sequence[Record]) -> list[str]:
+def row_of(variant: Variant, rows: pd.DataFrame) -> list[str]:
     """One line of the table."""
-    seconds = sorted(record["timings_s"]["registration"] for record in records if record["refused"] is None)
-    evaluations = [sum(s["evaluations"] for s in record["stages"]) for record in records if record["refused"] is None]
-    within = sum(not relative_is_wrong(record) for record in records)
-    middle = seconds[len(seconds) // 2] if seconds else float("nan")
-    mean = sum(evaluations) / len(evaluations) if evaluations else float("nan")
-    means = [number(statistics(records, quantity).mean) for quantity in QUANTITIES]
-    counts = confusion(records)
-    costs = [f"{mean:.0f}", number(middle, 1)]
-    return [variant.name, *means, f"{within} of {len(records)}", str(counts.wrong_trusted), *costs]
+    means = [number(statistics(rows, quantity.column).mean, 2) for quantity in QUANTITIES]
+    near, counts = within(rows, RELATIVE.column, WRONG_MM), confusion(rows)
+    assert counts is not None  # of whole runs there always is one
+    seconds = rows[f"{SECONDS}registration"].median() if f"{SECONDS}registration" in rows else float("nan")
+    evaluations = [cost.evaluations for cost in stage_costs(rows)]
+    costs = [number(sum(evaluations) if evaluations else float("nan"), 0), number(seconds, 1)]
+    return [variant.name, *means, f"{near.met} of {len(rows)}", str(counts.wrong_trusted), *costs]
 
 
 def ablation_table(rows: Sequence[Sequence[str]]) -> str:
     """The table of all variants."""
-    names = [f"{quantity.name}, {quantity.unit}" for quantity in QUANTITIES]
-    return table(("variant", *names, "relative ≤ 4 mm", "wrong, trusted", "evaluations", "s"), rows)
+    labels = [quantity.label for quantity in QUANTITIES]
+    header = ("variant", *labels, f"relative ≤ {WRONG_MM:g} mm", "wrong, trusted", "evaluations", "s")
+    return pipe_table(header, rows)
 
 
 def write_ablation(rows: Sequence[Sequence[str]], procedures: int, source: str, docs: Path | None) -> str:

@@ -1,4 +1,4 @@
-"""`python -m sim.study.cadaver`: a simulated cadaver study, and what of its errors is the ground truth's own.
+"""`python -m sim.study cadaver`: a simulated cadaver study, and what of its errors is the ground truth's own.
 
 One computed specimen has seven beads in its femur and a device five on its surface. In every trial six images are made
 with the beads in the beam, and a CT with the beads in the bone. Truths of three kinds are then held against each
@@ -13,7 +13,6 @@ The registration sees images and a CT from which the beads have been taken out (
 
 import csv
 import math
-import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +22,6 @@ from typing import Any
 import numpy as np
 import torch
 from femoreg_torch.configs import load_preset
-from jsonargparse import auto_cli
 from torch import Tensor
 
 from femoreg_torch.beads import (
@@ -37,7 +35,6 @@ from femoreg_torch.beads import (
     read_beads,
     write_measured,
 )
-from femoreg_torch.beads.table import NAMES, PAPER_TRIALS, summary
 from femoreg_torch.case import RESULT_NAME, Case, new_folder, read_case, read_result
 from femoreg_torch.case.femoroplasty import DEVICE, FEMUR
 from femoreg_torch.case.model import Side
@@ -47,10 +44,11 @@ from femoreg_torch.evaluation import errors
 from femoreg_torch.files import read_json, temporary_file, write_json, write_text
 from femoreg_torch.geometry import Poses, project_points, transform_points
 from femoreg_torch.settings import read_record
+from femoreg_torch.statistics.formats import pipe_table, plus_minus
+from femoreg_torch.statistics.quantities import METRICS, PAPER_TRIALS
 from femoreg_torch.volume import Volume, read_ct, read_mesh, write_landmarks, write_volume
 from sim.patient import make_scans
 from sim.physics.line_integrals import together
-from sim.study.page import table
 from sim.theatre.beads import PlacedBeads, ct_with_beads, device_beads, femur_beads
 from sim.theatre.case_folders import copied, write_images_and_case, write_patient_case
 from sim.theatre.images import posed_tissue, view_images
@@ -61,6 +59,7 @@ from sim.theatre.procedure import draw_procedure
 from sim.theatre.settings import load_simulation
 
 MEASURED, EXACT = "measured", "exact"
+NAMES = {quantity.column: quantity.label for quantity in METRICS}
 _ROMAN = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII", "IX", "X")
 _BEADS_NAME, _PLACED_NAME, _RECORD_NAME = "beads.yaml", "placed_beads.json", "record.json"
 
@@ -313,7 +312,7 @@ def _error_table(records: dict[str, dict[str, Any]]) -> str:
         paper = PAPER_TRIALS[key]
         shown = [f"{value:.2f}" for value in paper] if len(paper) == len(records) else [""] * len(records)
         rows.append([f"{title}, paper", *shown, _mean(paper), "–"])
-    return table(["simulated trial", *records, "mean ± SD", "truth's own, rms"], rows)
+    return pipe_table(["simulated trial", *records, "mean ± SD", "truth's own, rms"], rows)
 
 
 def _truth_table(records: dict[str, dict[str, Any]]) -> str:
@@ -326,12 +325,12 @@ def _truth_table(records: dict[str, dict[str, Any]]) -> str:
         for key, title in NAMES.items():
             values = [record["truth_errors"][truth][key] for record in records.values()]
             rows.append([f"{truth}: {title}", *(f"{v:.2f}" for v in values), _mean(values)])
-    return table(["error of the truth itself", *records, "mean ± SD"], rows)
+    return pipe_table(["error of the truth itself", *records, "mean ± SD"], rows)
 
 
 def _mean(values: list[float]) -> str:
-    mean, deviation = summary(values)
-    return f"{mean:.2f} ± {deviation:.2f}" if deviation == deviation else f"{mean:.2f}"
+    deviation = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+    return plus_minus(float(np.mean(values)), deviation, 2)
 
 
 def cadaver(settings: str = "cadaver", out: Path = Path("out/cadaver")) -> None:
@@ -350,17 +349,3 @@ def cadaver(settings: str = "cadaver", out: Path = Path("out/cadaver")) -> None:
         print(f"trial {name}: beads and registration", flush=True)
         records[name] = run_trial(study, out / "trials" / name, out / "measured" / name, number)
     print(write_results(study, records, out))
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the study; bad input is told in one line, with exit status 2."""
-    try:
-        auto_cli(cadaver, args=None if arguments is None else list(arguments), as_positional=False)
-    except InputError as error:
-        print(f"sim.study.cadaver: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,11 +12,13 @@ from femoreg_torch.case import read_case
 from femoreg_torch.case.femoroplasty import PELVIS
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import errors, reference_points
-from femoreg_torch.files import write_json
+from femoreg_torch.files import temporary_file, write_json
 from femoreg_torch.registration import Plan, prepare_scene, run_plan
 from femoreg_torch.registration.plan import Stage
-from sim.study import figures
-from sim.study.page import machine, table, write_section
+from femoreg_torch.statistics.figures import write_figures
+from femoreg_torch.statistics.formats import pipe_table
+from sim.study.capture_figure import capture_figure
+from sim.study.page import machine, write_section
 from sim.study.starts import Offset, displaced
 
 SUCCESS_MM, SUCCESS_DEG = 10.0, 2.0  # one view leaves millimetres of depth; the stages after it settle them
@@ -98,9 +100,8 @@ def write_capture(records: Sequence[dict[str, Any]], plan: Plan, out: Path, docs
     rates = success_rates(records)
     names = ", ".join(f"“{step.name}”" for step in first_stages(plan).steps)
     cases = sorted({record["case"] for record in records})
-    figure = figures.capture_figure(rates, AXIS_LABELS, f"Capture range of the pelvis in view 1, `{plan.preset}`")
-    for folder in (out, *([docs] if docs else [])):
-        figures.save(figure, folder / f"capture_{plan.preset}.png")
+    title = f"Capture range of the pelvis in view 1, {plan.preset}"
+    (picture,) = write_figures([capture_figure(rates, AXIS_LABELS, f"capture_{plan.preset}", title)], out)
     write_json(out / f"capture_{plan.preset}.json", {"preset": plan.preset, "starts": list(records)})
     rows = [
         [sweep, *(f"{value:g}: {good} of {starts}" for value, good, starts in points)]
@@ -113,11 +114,13 @@ def write_capture(records: Sequence[dict[str, Any]], plan: Plan, out: Path, docs
             f"and its rotation within {SUCCESS_DEG:g}° afterwards; the femur starts as the CT has it. Shaded: 95 % "
             "interval.",
             f"![Success rate against start offset](capture_{plan.preset}.png)",
-            table(("offset: successes", *([""] * (len(LEVELS) + 1))), rows),
+            pipe_table(("offset: successes", *([""] * (len(LEVELS) + 1))), rows),
             f"Jointly: % of {FULL['rotation']:g}°, {FULL['depth']:g} mm and {FULL['lateral']:g} mm at once. "
             f"Measured on: {machine()}",
         ]
     )
     if docs:
         write_section(docs, f"Capture range: `{plan.preset}`", text)
+        with temporary_file(docs / f"capture_{plan.preset}.png") as part:
+            part.write_bytes(picture.png)
     return text

@@ -25,7 +25,7 @@ from femoreg_torch.navigation import guide
 from femoreg_torch.settings import read_record
 from sim.study.conditions import Body, Condition, image_views, make_case, simulation_of, write_told
 from sim.study.procedures import Procedure
-from sim.study.summary import Record, outcome
+from sim.study.record import Record, outcome
 from sim.theatre import procedure as theatre
 from sim.theatre.case_folders import copied
 from sim.theatre.preoperative_case import read_preoperative

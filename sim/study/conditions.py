@@ -5,14 +5,15 @@ by view, so that each further condition costs a few seconds. Remove the folder o
 integrals, have changed.
 """
 
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from femoreg_torch.configs import laid_over, load_preset
-from joblib import Parallel, delayed, parallel_config
+from femoreg_torch.configs import laid_over
+from joblib import delayed
 from torch import Tensor
 
 from femoreg_torch.case import new_folder
@@ -29,7 +30,8 @@ from sim.study.cases import PROCEDURAL_IMAGED_MM, REAL_IMAGED_MM, REGISTERED_MM,
 from sim.study.code import digest
 from sim.study.faults import FAULTS, read_case_file, write_case_file
 from sim.study.imperfect_ct import ImperfectCt, spoil_ct
-from sim.study.procedures import Procedure, Study
+from sim.study.procedures import Procedure
+from sim.study.processes import in_processes
 from sim.theatre import procedure as theatre
 from sim.theatre.case_folders import check_same_patient, copied, write_images_and_case, write_patient_case
 from sim.theatre.device import make_device_parts
@@ -68,32 +70,15 @@ class Condition:
 
 
 @dataclass(frozen=True)
-class _Conditions:
-    conditions: list[Condition]
-
-
-@dataclass(frozen=True)
 class Imaged:
     """Folders that conditions are written to."""
 
-    bodies: Path
+    bodies: Path | None  # what the patients' rays are kept in for later conditions, if they are to be kept
     conditions: Path
 
     def case(self, condition: Condition, procedure: Procedure) -> Path:
         """Where the case of a procedure under a condition stands."""
         return self.conditions / condition.name / procedure.name
-
-
-def read_conditions(name: str | Path, only: Sequence[str] = ()) -> list[Condition]:
-    """Conditions of a preset in `configs/study/` or of a YAML file, or those of some names. Raises `InputError`."""
-    known = read_record(_Conditions, load_preset("study", name), f"conditions {name}").conditions
-    names = [condition.name for condition in known]
-    for condition in known:
-        check_faults(condition, f"conditions {name}, {condition.name}")
-    for wanted in only:
-        if wanted not in names:
-            raise InputError(f"conditions {name}: there is no {wanted!r}; there are: {', '.join(names)}.")
-    return [condition for condition in known if not only or condition.name in only]
 
 
 def check_faults(condition: Condition, where: str) -> None:
@@ -103,40 +88,49 @@ def check_faults(condition: Condition, where: str) -> None:
 
 
 def make_conditions(
-    chosen: Sequence[Procedure], conditions: Sequence[Condition], study: Study, stores: Stores, out: Imaged, jobs: int
+    chosen: Sequence[Procedure],
+    conditions: Sequence[Condition],
+    base: dict[str, Any],
+    stores: Stores,
+    out: Imaged,
+    jobs: int,
 ) -> None:
-    """Make the cases that are not there yet, `jobs` procedures at a time and each on one core."""
-    with parallel_config(backend="loky", inner_max_num_threads=1):
-        Parallel(n_jobs=jobs, verbose=5)(
-            delayed(_image_alone)(procedure, conditions, study, stores, out) for procedure in chosen
-        )
+    """Make the cases that are not there yet, `jobs` procedures at a time and each on one core.
+
+    `base` is the content of the `Simulation` that the conditions start from.
+    """
+    tasks = [delayed(_image_alone)(procedure, conditions, base, stores, out) for procedure in chosen]
+    for _ in in_processes(jobs, tasks):
+        pass
 
 
 def _image_alone(
-    procedure: Procedure, conditions: Sequence[Condition], study: Study, stores: Stores, out: Imaged
+    procedure: Procedure, conditions: Sequence[Condition], base: dict[str, Any], stores: Stores, out: Imaged
 ) -> None:
     torch.set_num_threads(1)
-    image_procedure(procedure, conditions, study, stores, out, lambda _: None)
+    with tempfile.TemporaryDirectory() as scratch:
+        body = body_of(procedure, stores, out, Path(scratch))
+        for condition in conditions:
+            made_once(condition, procedure, base, body, out)
 
 
-def image_procedure(
-    procedure: Procedure,
-    conditions: Sequence[Condition],
-    study: Study,
-    stores: Stores,
-    out: Imaged,
-    report: Callable[[str], None],
-) -> None:
-    """Make the cases of a procedure under all conditions, but for those that are there."""
-    body = Body(procedure, stores, out.bodies / procedure.name)
-    base = load_preset("simulation", study.acquisition)
-    for condition in conditions:
-        if not _ready(condition, procedure, base, out):
-            report(condition.name)
-            make_case(condition, procedure, base, body, out.case(condition, procedure))
+def body_of(procedure: Procedure, stores: Stores, out: Imaged, scratch: Path) -> "Body":
+    """The patient of a procedure; its rays are kept in `scratch` where they are not to be kept."""
+    return Body(procedure, stores, scratch / "body" if out.bodies is None else out.bodies / procedure.name)
 
 
-def _ready(condition: Condition, procedure: Procedure, base: dict[str, Any], out: Imaged) -> bool:
+def made_once(condition: Condition, procedure: Procedure, base: dict[str, Any], body: "Body", out: Imaged) -> Path:
+    """The case folder of a procedure under a condition; it is made unless it is there, by whichever code.
+
+    Raises `InputError` if it was made with other settings.
+    """
+    folder = out.case(condition, procedure)
+    if not is_made(condition, procedure, base, out):
+        make_case(condition, procedure, base, body, folder)
+    return folder
+
+
+def is_made(condition: Condition, procedure: Procedure, base: dict[str, Any], out: Imaged) -> bool:
     """Whether a case is there. Raises `InputError` if it was made with other settings."""
     path = out.case(condition, procedure) / _ORIGIN
     if not path.is_file():

@@ -1,108 +1,90 @@
-"""What procedures imaged under other conditions cost: one table for each, and one that compares them."""
+"""The section of `docs/accuracy.md` on procedures imaged under other conditions: a table of all, and one for each."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
-from femoreg_torch.files import write_json
-from sim.study.accuracy import write_csv
-from sim.study.conditions import Condition
-from sim.study.page import machine, number, table, write_section
-from sim.study.quantities import QUANTITIES
-from sim.study.summary import OBJECTS, Record, all_quantities, confusion, coverage, rows_of_csv, statistics
+import pandas as pd
 
-_COMPARED = ("pelvis", "femur", "device", "C-arm view 2", "C-arm view 3", "guide tip", "entry point to tip")
-_WITH_ROTATION = ("femur", "device")
-_AXES = ("IS", "LR", "AP")
-Run = tuple[Condition, Sequence[Record]]
+from femoreg_torch.statistics.formats import number, pipe_table
+from femoreg_torch.statistics.quantities import AXES, BY_COLUMN, OBJECTS, QUANTITIES
+from femoreg_torch.statistics.summary import confusion, coverage, statistics
+from sim.study.accuracy_page import error_cells, procedure_name, versions_told, why
+from sim.study.page import machine, write_section
+
+_COMPARED = (
+    "pelvis_mm", "femur_mm", "femur_deg", "device_mm", "device_deg", "view2_mm", "view3_mm", "tip_mm", "relative_mm",
+)  # fmt: skip
 
 
 def write_conditions(
-    runs: Sequence[Run], preset: str, first: int | None, command: str, out: Path, docs: Path | None
+    rows: pd.DataFrame, names: Sequence[str], preset: str, first: int | None, command: str, docs: Path | None
 ) -> str:
-    """Write runs and statistics of every condition into `out`, and the section into `docs`, if given; returns it.
+    """Put the section of these conditions into `docs`, if given; returns it.
 
     The section is that of the `first` so many procedures; others keep theirs.
     """
-    for condition, records in runs:
-        folder = out / condition.name
-        folder.mkdir(parents=True, exist_ok=True)
-        write_csv(folder / "runs.csv", rows_of_csv(records))
-        found = {"/".join(quantity.path): asdict(of) for quantity, of in all_quantities(records)}
-        covered = {f"{name}/{kind}": asdict(of) for name, kind, of in coverage(records)}
-        write_json(folder / "summary.json", {"preset": preset, "statistics": found, "coverage": covered})
-    text = section(runs, preset, command)
+    text = section({name: rows[rows["condition"].eq(name)] for name in names}, preset, command)
     if docs:
         some = "" if first is None else f", first {first} procedures"
         write_section(docs, f"Conditions: `{preset}`{some}", text)
     return text
 
 
-def section(runs: Sequence[Run], preset: str, command: str) -> str:
-    """The Markdown of all conditions."""
-    codes = {record["code"] for _, records in runs for record in records}
-    return "\n\n".join(
-        [
-            f"`{command}`: simulated procedures imaged again under the conditions of `configs/study/conditions.yaml`, "
-            f"and registered by `{preset}`. Means over all runs that gave poses, mm and degrees.",
-            *([f"**The runs come from {len(codes)} versions of the code.**"] if len(codes) > 1 else []),
-            _comparison(runs),
-            *(part for run in runs for part in _of_one(*run)),
-            f"Measured on: {machine()}",
-        ]
-    )
-
-
-def _comparison(runs: Sequence[Run]) -> str:
-    shown = [q for q in QUANTITIES if q.name in _COMPARED or q.name in [f"{n}, rotation" for n in _WITH_ROTATION]]
-    header = ("condition", "runs", *(f"{q.name}, {q.unit}" for q in shown), "right, flagged", "**wrong, trusted**")
-    rows = []
-    for condition, records in runs:
-        counts = confusion(records)
-        means = [number(statistics(records, quantity).mean) for quantity in shown]
-        right = counts.right_trusted + counts.right_flagged
-        told = [f"{counts.right_flagged} of {right}", str(counts.wrong_trusted)]
-        rows.append([condition.name, str(len(records)), *means, *told])
-    return table(header, rows)
-
-
-def _of_one(condition: Condition, records: Sequence[Record]) -> list[str]:
-    rows = [
-        [
-            f"{quantity.name}, {quantity.unit}",
-            number(quantity.paper),
-            f"**{number(found.mean)}** ± {number(found.deviation)}",
-            number(found.median),
-            number(found.maximum),
-        ]
-        for quantity, found in all_quantities(records)
+def section(runs: dict[str, pd.DataFrame], preset: str, command: str) -> str:
+    """The Markdown of all conditions, the runs of each by its name."""
+    parts = [
+        f"`{command}`: simulated procedures imaged again under the conditions of `configs/study/conditions.yaml`, "
+        f"and registered by `{preset}`. Means over all runs that gave poses, mm and degrees.",
+        versions_told(pd.concat(runs.values())),
+        _comparison(runs),
+        *(part for name, rows in runs.items() for part in _of_one(name, rows)),
+        f"Measured on: {machine()}",
     ]
-    flagged = [record for record in records if not record["trusted"]]
-    counts = confusion(records)
-    told = (
+    return "\n\n".join(part for part in parts if part)
+
+
+def _comparison(runs: dict[str, pd.DataFrame]) -> str:
+    labels = [BY_COLUMN[column].label for column in _COMPARED]
+    header = ("condition", "runs", *labels, "right, flagged", "**wrong, trusted**")
+    lines = []
+    for name, rows in runs.items():
+        counts = confusion(rows)
+        assert counts is not None  # of whole runs there always is one
+        means = [number(statistics(rows, column).mean, 2) for column in _COMPARED]
+        right = counts.right_trusted + counts.right_flagged
+        lines.append([name, str(len(rows)), *means, f"{counts.right_flagged} of {right}", str(counts.wrong_trusted)])
+    return pipe_table(header, lines)
+
+
+def _of_one(name: str, rows: pd.DataFrame) -> list[str]:
+    header = ("mean error", "paper", "mean ± sd", "median", "max")
+    counts, device = confusion(rows), confusion(rows, "device")
+    assert counts is not None  # of whole runs there always is one
+    trusted = 0 if device is None else device.right_trusted
+    sentence = (
         f"Of {counts.right_trusted + counts.right_flagged} right runs {counts.right_flagged} are flagged; of "
         f"{counts.wrong_trusted + counts.wrong_flagged} wrong ones **{counts.wrong_trusted}** are trusted. The device "
-        f"is trusted in {confusion(records, 'device').right_trusted} runs."
+        f"is trusted in {trusted} runs."
     )
-    reasons = [
-        f"- {record['number']}: {record['patient']}, {record['side']}: "
-        + (record["refused"].split("/")[-1] if record["refused"] is not None else "; ".join(record["reasons"]))
-        for record in flagged
-    ]
+    flagged = [f"- {procedure_name(row)}: {why(row)}" for _, row in rows[~rows["trusted"]].iterrows()]
     return [
-        f"### {condition.name}",
-        table(("mean error", "paper", "mean ± sd", "median", "max"), rows),
-        told,
-        *(["\n".join(reasons)] if reasons else []),
-        _coverage(records),
+        f"### {name}",
+        pipe_table(header, [error_cells(rows, quantity.column) for quantity in QUANTITIES]),
+        sentence,
+        "\n".join(flagged),
+        _coverage(rows),
     ]
 
 
-def _coverage(records: Sequence[Record]) -> str:
+def _coverage(rows: pd.DataFrame) -> str:
     """How many errors lie within one and two of the standard deviations that the results state."""
-    rows = [
-        [f"{name}, {kind}", *(f"{100 * a:.0f}, {100 * b:.0f}" for a, b in zip(of.within_1, of.within_2, strict=True))]
-        for name, kind, of in coverage(records)
+    lines = [
+        [
+            f"{found.object}, {found.unit}",
+            *(f"{100 * a.share:.0f}, {100 * b.share:.0f}" for a, b in zip(found.within_1, found.within_2, strict=True)),
+        ]
+        for found in coverage(rows)
     ]
-    header = (f"% of errors within 1 and 2 stated deviations, {len(OBJECTS)} objects", *_AXES)
-    return table(header, rows) if rows else ""
+    axes = [axis.upper() for axis in AXES]
+    header = (f"% of errors within 1 and 2 stated deviations, {len(OBJECTS)} objects", *axes)
+    return pipe_table(header, lines) if lines else ""

@@ -20,8 +20,8 @@ import torch
 from femoreg_torch.errors import defect_in_one_line
 from femoreg_torch.registration.run import versions
 from sim.study.procedures import Procedure
+from sim.study.record import Record, outcome
 from sim.study.store import FAILED, Batch, Run, Store
-from sim.study.summary import Record, outcome
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 _ROOM_BYTES = 100e6  # what a run writes; some libraries do not tell a full disk from other failures

@@ -3,14 +3,15 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from joblib import Parallel, delayed, parallel_config
+from joblib import delayed
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from femoreg_torch.errors import InputError
 from sim.study.engine import Work, give_up, perform
+from sim.study.processes import in_processes
 from sim.study.store import Batch, Store
 
-PATIENCE = "30s"  # with a scheduler that does not answer
+PATIENCE = "10s"  # with a scheduler that does not answer
 
 
 @dataclass(frozen=True)
@@ -34,17 +35,15 @@ class OnThisMachine:
                     self._alone(work, store, left.pop(number), done)
 
     def _all_at_once(self, work: Work, store: Store, left: dict[int, Batch], done: Callable[[Batch], None]) -> None:
-        with parallel_config(backend="loky", inner_max_num_threads=1):
-            tasks = (delayed(_perform)(work, store, batch) for batch in list(left.values()))
-            for number in Parallel(n_jobs=self.jobs, return_as="generator_unordered")(tasks):
-                done(left.pop(number))
+        tasks = (delayed(_perform)(work, store, batch) for batch in list(left.values()))
+        for number in in_processes(self.jobs, tasks):
+            done(left.pop(number))
 
     def _alone(self, work: Work, store: Store, batch: Batch, done: Callable[[Batch], None]) -> None:
         rest = batch
         while rest.runs:
             try:
-                with parallel_config(backend="loky", inner_max_num_threads=1):
-                    Parallel(n_jobs=2)([delayed(_perform)(work, store, rest)])  # one process beside this one
+                list(in_processes(2, [delayed(_perform)(work, store, rest)]))  # one process beside this one
                 break
             except TerminatedWorkerError:
                 store.clear_killed()

@@ -256,8 +256,8 @@ def registered_row(folder: Path, plan: Plan, truth: Poses, model: XrayModel, see
     case = read_case(folder)
     scene = prepare_scene(case)
     carm = replace(scene.carm, camera=stage.level.camera(scene.carm.camera))
-    blank = {kind: (torch.zeros(carm.camera.shape),) * scene.views for kind in scene.images}
-    scene = replace(scene, carm=carm, images=blank, fields={}, segmentations=())
+    black: tuple[Tensor | None, ...] = (torch.zeros(carm.camera.shape),) * scene.views
+    scene = replace(scene, carm=carm, images=dict.fromkeys(scene.images, black), fields={}, segmentations=())
     points = reference_points(case, scene)
     photons = photons_per_pixel(model, carm.camera)
     images = drawn_images(scene, truth, points, stage.level.step_mm, stage.imaging, photons)

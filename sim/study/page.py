@@ -2,7 +2,6 @@
 
 import os
 import platform
-from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,19 +14,6 @@ Every figure on this page was written by the command named above it, and comes f
 procedural patients (computed shapes), and CTs with invented grey values around real bone shapes (*real*). It says
 nothing about patients. The paper's figures beside them are means over 1,000 simulations of another anatomy in another
 simulator (Gao et al., IEEE Trans Med Robot Bionics 2 (2020) 437, Tables I and II)."""
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table, first column to the left, all others to the right."""
-    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def number(value: float, digits: int = 2) -> str:
-    """For a table: – for what is not known, ∞ for what no pose was found for."""
-    if value != value:
-        return "–"
-    return "∞" if value == float("inf") else f"{value:.{digits}f}"
 
 
 def write_section(docs: Path, title: str, text: str) -> None:

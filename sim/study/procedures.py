@@ -1,27 +1,9 @@
 """Which procedures a study consists of."""
 
 from dataclasses import dataclass
-from pathlib import Path
-
-from femoreg_torch.configs import load_preset
 
 from femoreg_torch.case.model import Side
 from femoreg_torch.errors import InputError
-from femoreg_torch.settings import read_record
-from sim.study.detections import DetectionNoise
-
-
-@dataclass(frozen=True)
-class Study:
-    """Settings of a study; their meaning is told in `configs/study/accuracy.yaml`."""
-
-    subjects: list[str]
-    per_subject: int
-    first_patient: int
-    patients: int
-    first_seed: int
-    acquisition: str
-    detections: DetectionNoise
 
 
 @dataclass(frozen=True)
@@ -51,24 +33,29 @@ class Procedure:
         return f"{self.number:02d}_{self.patient}_{self.side}"
 
 
-def load_study(name: str | Path) -> Study:
-    """Settings of a preset in `configs/study/` or of a YAML file. Raises `InputError` that names the key."""
-    return read_record(Study, load_preset("study", name), f"study {name}")
+@dataclass(frozen=True)
+class Cohort:
+    """Procedures with following seeds, half of them on real bone shapes; see `configs/study/accuracy.yaml`."""
 
+    subjects: list[str]
+    per_subject: int
+    first_patient: int
+    patients: int
+    first_seed: int
 
-def procedures(study: Study) -> list[Procedure]:
-    """All procedures, so ordered that any first few of them hold both kinds of patient, all subjects and both sides.
+    def procedures(self) -> list[Procedure]:
+        """All of them, so ordered that any first few hold both kinds of patient, all subjects and both sides.
 
-    Procedural patients and subjects take turns while both last; the subjects follow one another in rounds, and change
-    sides from round to round.
-    """
-    sides: tuple[Side, Side] = ("left", "right")
-    count = len(study.subjects)
-    procedural = [(str(study.first_patient + n), sides[n % 2]) for n in range(study.patients)]
-    real = [
-        (study.subjects[n % count], sides[(1 + n % count + n // count) % 2]) for n in range(count * study.per_subject)
-    ]
-    shared = min(len(procedural), len(real))
-    turns = [patient for pair in zip(procedural, real, strict=False) for patient in pair]
-    turns += procedural[shared:] + real[shared:]
-    return [Procedure(n + 1, patient, side, study.first_seed + n) for n, (patient, side) in enumerate(turns)]
+        Procedural patients and subjects take turns while both last; the subjects follow one another in rounds, and
+        change sides from round to round.
+        """
+        sides: tuple[Side, Side] = ("left", "right")
+        count = len(self.subjects)
+        procedural = [(str(self.first_patient + n), sides[n % 2]) for n in range(self.patients)]
+        real = [
+            (self.subjects[n % count], sides[(1 + n % count + n // count) % 2]) for n in range(count * self.per_subject)
+        ]
+        shared = min(len(procedural), len(real))
+        turns = [patient for pair in zip(procedural, real, strict=False) for patient in pair]
+        turns += procedural[shared:] + real[shared:]
+        return [Procedure(n + 1, patient, side, self.first_seed + n) for n, (patient, side) in enumerate(turns)]

@@ -15,7 +15,7 @@ from femoreg_torch.settings import read_record
 from sim.study.closed_loop import ClosedLoop
 from sim.study.conditions import Condition, check_faults
 from sim.study.detections import DetectionNoise
-from sim.study.procedures import Procedure
+from sim.study.procedures import Cohort, Procedure
 from sim.study.starts import Offset
 
 _NAME = re.compile(r"[A-Za-z0-9_]+")
@@ -42,11 +42,23 @@ class Protocol:
     seed: int = 1
     first_patient: int = 10001
     subjects: list[str] = field(default_factory=list)
+    cohort: Cohort | None = None
     simulation: str = "paper"
     preset: str = "fast"
     detections: DetectionNoise | None = None
     closed_loop: ClosedLoop | None = None
     cases: list[str] = field(default_factory=list)
+
+    @property
+    def bones(self) -> list[str]:
+        """Names of the real bone shapes that some of its patients are built around."""
+        return self.subjects if self.cohort is None else self.cohort.subjects
+
+    def first(self, count: int, real: bool) -> list[Procedure]:
+        """The first so many procedures, or all that there are; only where `real`, some are on real bone shapes."""
+        if self.cohort is None:
+            return [self.procedure(number, real) for number in range(1, count + 1)]
+        return [procedure for procedure in self.cohort.procedures() if real or procedure.procedural][:count]
 
     def procedure(self, number: int, real: bool) -> Procedure:
         """The procedure of a number (from 1), whichever others are run.
@@ -85,6 +97,8 @@ def _problems(protocol: Protocol) -> Iterator[str]:
             yield f"vary: {name!r} is to be part of file names. Use letters, digits and _."
         if names.count(name) > 1:
             yield f"vary: {names.count(name)} conditions are called {name!r}. Rename them."
+    if protocol.cohort is not None and protocol.subjects:
+        yield "subjects: stand in `cohort` where there is one."
     if protocol.procedures < 1:
         yield f"procedures: at least 1 was expected, got {protocol.procedures}."
     if min(protocol.seed, protocol.first_patient) < 0:

@@ -4,17 +4,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from femoreg_torch.files import temporary_file
-from sim.study.summary import Record, flat_errors, flat_stages
+from femoreg_torch.statistics.quantities import AXES
+from femoreg_torch.statistics.rows import IDENTITY, ROWS_NAME, checked_rows
+from sim.study.record import Record
 
-TABLE_NAME = "runs.parquet"
-_AXES = ("is", "lr", "ap")
+TABLE_NAME = ROWS_NAME
 _PER_AXIS = (1, 0, 2)  # errors are told along IS, LR and AP, deviations along the camera's x, y and z
 _DIFFERS = ("seconds_", "host", "version_")  # what may differ between two runs of the same study
-_HEAD = ("study", "condition", "number", "patient", "kind", "side", "seed", "preset", "code", "settings")
 _LAST = ("evaluations_", "seconds_", "version_", "host")  # beginnings of the columns that stand at the end
 
 Row = dict[str, Any]
@@ -22,7 +23,7 @@ Row = dict[str, Any]
 
 def rows_of(record: Record) -> list[Row]:
     """The row of a run; of a closed loop, one for each round."""
-    head: Row = {key: record[key] for key in _HEAD}
+    head: Row = {key: record[key] for key in IDENTITY}
     head |= {f"varied_{key}": value for key, value in record["varied"].items()}
     tail = {"seconds_run": record["run_s"]} if "run_s" in record else {}
     tail |= {f"version_{key}": value for key, value in record["versions"].items()} | {"host": record["host"]}
@@ -39,13 +40,40 @@ def _of_round(record: Record) -> Row:
     if record.get("pelvis_at_head_mm") is not None:
         row["pelvis_at_head_mm"] = record["pelvis_at_head_mm"]
     for point, shift in (record.get("displacements_mm") or {}).items():
-        row |= {f"{point}_mm_{axis}": part for axis, part in zip(_AXES, shift, strict=True)}
+        row |= {f"{point}_mm_{axis}": part for axis, part in zip(AXES, shift, strict=True)}
     for name, quality in record.get("quality", {}).items():
         row[f"{name}_trusted"] = quality["trusted"]
         for unit, key in (("mm", "translation_deviation_mm"), ("deg", "rotation_deviation_deg")):
-            row |= {f"{name}_sigma_{unit}_{axis}": quality[key][n] for axis, n in zip(_AXES, _PER_AXIS, strict=True)}
+            row |= {f"{name}_sigma_{unit}_{axis}": quality[key][n] for axis, n in zip(AXES, _PER_AXIS, strict=True)}
     row |= flat_stages(record.get("stages", ()))
     return row | {f"seconds_{key}": value for key, value in record.get("timings_s", {}).items()}
+
+
+def flat_errors(errors: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
+    """Errors by name and unit, those of poses signed along each axis too."""
+    row: dict[str, float] = {}
+    for key, value in errors.items():
+        if not isinstance(value, dict):
+            row[f"{prefix}{key}"] = value
+            continue
+        for unit in ("mm", "deg"):
+            row[f"{prefix}{key}_{unit}"] = value[unit]
+            row |= {f"{prefix}{key}_{unit}_{axis}": v for axis, v in zip(AXES, value[f"{unit}_xyz"], strict=True)}
+    return row
+
+
+def flat_stages(stages: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Evaluations and seconds of every step, and of every view that it is run on."""
+    row: dict[str, float] = {}
+    for stage in stages:
+        name = stage["name"].replace(" ", "_") + ("" if stage["view"] is None else f"_view{stage['view']}")
+        row |= {f"evaluations_{name}": stage["evaluations"], f"seconds_{name}": stage["seconds"]}
+    return row
+
+
+def frame_of(records: Sequence[Record]) -> pd.DataFrame:
+    """The rows of records as `femoreg_torch.statistics` takes them."""
+    return checked_rows(table_of(records).to_pandas(), "records")
 
 
 def table_of(records: Sequence[Record]) -> pa.Table:
@@ -57,7 +85,7 @@ def table_of(records: Sequence[Record]) -> pa.Table:
 
 def _place(name: str) -> int:
     """What is told of a run, what was varied, results, costs, versions and host; in each as the rows have them."""
-    if name in _HEAD:
+    if name in IDENTITY:
         return 0
     last = (place for place, start in enumerate(_LAST, 3) if name.startswith(start))
     return 1 if name.startswith("varied_") else next(last, 2)

@@ -3,22 +3,21 @@
 Any number of processes, on any number of machines, may write into one folder; one command at a time has charge of it.
 """
 
-import fcntl
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json, write_json
+from sim.study.owner import is_left, mark, owning
 from sim.study.procedures import Procedure
-from sim.study.summary import Record
+from sim.study.record import Record
 
-_RUNS, _SCRATCH, _LOCK = "runs", "scratch", ".lock"
+_RUNS, _SCRATCH = "runs", "scratch"
 FAILED = "failed"  # a run that a defect ended; it is no result, and is tried again
 
 
@@ -63,21 +62,10 @@ class Store:
 
     @contextmanager
     def in_charge(self) -> Iterator[None]:
-        """Raises `InputError` if another command has charge of the folder; the system ends that with its process."""
+        """Raises `InputError` if another command has charge of the folder, and may still be alive."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        lock = os.open(self.folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f"{self.folder}: another `femoreg study` is writing there. Wait, or choose another --out."
-            ) from None
-        except OSError:  # a file system without locks
-            pass
-        try:
+        with owning(self.folder):
             yield
-        finally:
-            os.close(lock)
 
     def path(self, run: Run) -> Path:
         """Of the record of a run."""
@@ -102,29 +90,18 @@ class Store:
 
     @contextmanager
     def scratch(self, number: int) -> Iterator[Path]:
-        """A folder for a procedure in flight, locked by this process, and removed afterwards."""
+        """A folder for a procedure in flight, marked as this process's, and removed afterwards."""
         with tempfile.TemporaryDirectory(prefix=f"{number:05d}-", dir=self.folder / _SCRATCH) as folder:
-            lock = os.open(Path(folder) / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(lock, fcntl.LOCK_EX)
-            try:
-                yield Path(folder)
-            finally:
-                os.close(lock)
+            mark(Path(folder))
+            yield Path(folder)
 
     def clear_killed(self) -> set[int]:
-        """Remove the scratch folders that no live process holds. Returns the procedures that they were of."""
+        """Remove the scratch folders of processes of this machine that are gone. Returns their procedures."""
         numbers = set()
         for left in (self.folder / _SCRATCH).iterdir():
-            try:
-                lock = os.open(left / _LOCK, os.O_RDWR)
-            except FileNotFoundError:  # just being made, or removed
-                continue
-            with suppress(OSError):  # somebody holds it
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if is_left(left):
                 numbers.add(int(left.name.partition("-")[0]))
                 shutil.rmtree(left, ignore_errors=True)
-            os.close(lock)
         return numbers
 
 

@@ -2,9 +2,10 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from femoreg_torch.case import read_case
 from femoreg_torch.errors import InputError
@@ -13,9 +14,9 @@ from sim.study.code import digest, digest_of_folder, library_and_simulator
 from sim.study.engine import DISK_FULL, Executor, Work, carry_out
 from sim.study.procedures import Procedure
 from sim.study.protocol import Protocol, load_protocol, varied
+from sim.study.record import Record
 from sim.study.rows import TABLE_NAME, write_table
 from sim.study.store import Run, Store, batches, missing
-from sim.study.summary import Record
 from sim.study.trial import kind
 from sim.study.work import Recorded, Setting, Simulated, settings_of
 
@@ -54,19 +55,35 @@ def plan_study(config: str, procedures: int | None, out: Path, data: Path | None
     settings = settings_of(protocol, name)
     if protocol.cases:
         return _of_cases(protocol, name, settings, count, out)
-    real = bool(data is not None and protocol.subjects)
+    real = bool(data is not None and protocol.bones)
     stores = Stores(out / "cases", out / "patients", (data or Path()).resolve())
-    subjects = protocol.subjects if real else []
+    subjects = protocol.bones if real else []
     _check_meshes(stores, subjects)
-    cohort = {"seed": protocol.seed, "first_patient": protocol.first_patient, "subjects": subjects}
-    digests = {key: digest(cohort, setting.digest) for key, setting in settings.items()}
-    runs = [
-        _run(name, settings[key], procedure, digests[key], kind(procedure))
-        for procedure in (protocol.procedure(number, real) for number in range(1, count + 1))
-        for key in settings
-    ]
+    chosen = protocol.first(count, real)
+    if procedures is not None and len(chosen) < procedures:
+        raise InputError(f"--procedures: study {name} has {len(chosen)} procedures, {procedures} were asked for.")
+    runs = runs_of(name, settings, chosen, cohort_of(protocol, subjects))
     kept = stores.cases if keep_cases else None
     return Study(runs, Simulated(settings, stores, out.resolve() / OVERLAYS, kept), subjects, stores)
+
+
+def cohort_of(protocol: Protocol, subjects: Sequence[str]) -> dict[str, Any]:
+    """What the procedures of a protocol follow from."""
+    if protocol.cohort is not None:
+        return asdict(protocol.cohort)
+    return {"seed": protocol.seed, "first_patient": protocol.first_patient, "subjects": subjects}
+
+
+def runs_of(
+    name: str, settings: Mapping[str, Setting], chosen: Sequence[Procedure], cohort: dict[str, Any]
+) -> list[Run]:
+    """The runs of a study called `name`: every procedure under every condition, in this order."""
+    digests = {key: digest(cohort, setting.digest) for key, setting in settings.items()}
+    return [
+        _run(name, key, setting, procedure, digests[key], kind(procedure))
+        for procedure in chosen
+        for key, setting in settings.items()
+    ]
 
 
 def _of_cases(protocol: Protocol, name: str, settings: dict[str, Setting], count: int, out: Path) -> Study:
@@ -81,10 +98,11 @@ def _of_cases(protocol: Protocol, name: str, settings: dict[str, Setting], count
         procedure = Procedure(number, folder.name, case.side, protocol.procedure(number, False).seed)
         content = digest_of_folder(folder)
         cases[number] = folder
-        for setting in settings.values():
+        for key, setting in settings.items():
             if case.truth is None and (setting.detections or setting.variation.start):
                 raise InputError(f"{folder}: has no truth, from which `start` and `detections` could be drawn.")
-            runs.append(_run(name, setting, procedure, digest(protocol.seed, setting.digest, content), RECORDED))
+            made_with = digest(protocol.seed, setting.digest, content)
+            runs.append(_run(name, key, setting, procedure, made_with, RECORDED))
     return Study(runs, Recorded(settings, cases, out.resolve() / OVERLAYS))
 
 
@@ -93,9 +111,9 @@ def _matching(pattern: str) -> list[Path]:
     return sorted(Path(anchor or ".").glob(str(Path(pattern).relative_to(anchor))))
 
 
-def _run(study: str, setting: Setting, procedure: Procedure, settings: str, of_kind: str) -> Run:
+def _run(study: str, condition: str, setting: Setting, procedure: Procedure, settings: str, of_kind: str) -> Run:
     what = tuple(varied(setting.variation).items())
-    return Run(study, setting.variation.name, procedure, settings, of_kind, setting.plan.preset, what)
+    return Run(study, condition, procedure, settings, of_kind, setting.plan.preset, what)
 
 
 def _check_meshes(stores: Stores, subjects: Sequence[str]) -> None:

@@ -9,9 +9,8 @@ import cv2
 import torch
 from torch import Tensor
 
-from femoreg_torch.case import Case, Result, read_case
-from femoreg_torch.case.femoroplasty import FEMUR, PELVIS
-from femoreg_torch.detect import load_network
+from femoreg_torch.case import Case, Result
+from femoreg_torch.case.femoroplasty import DEVICE, FEMUR, PELVIS
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import ReferencePoints, errors, overlay_figure, path_displacements, reference_points
 from femoreg_torch.evaluation.overlay import Picture
@@ -21,27 +20,10 @@ from femoreg_torch.registration import Plan
 from femoreg_torch.registration.run import register_scene
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.registration.start import Detector
-from sim.study.detections import simulated_detector
-from sim.study.procedures import Procedure, Study
-from sim.study.summary import OBJECTS
+from sim.study.procedures import Procedure
 
+_STARTED = (PELVIS, FEMUR, DEVICE)  # objects whose errors at the start are kept
 _OVERLAY_PX = 900  # width of a run's picture
-
-
-def run_trial(folder: Path, procedure: Procedure, study: Study, plan: Plan, views: int | None = None) -> dict[str, Any]:
-    """Register the case in `folder` from simulated detections; `views` uses only so many of its views.
-
-    A registration that refuses its input (`InputError`) is a result too: `refused` then holds the reason, else None,
-    and there are no `errors`.
-    """
-    case = first_views(read_case(folder), views)
-    if case.truth is None:
-        raise InputError(f"{folder}: has no truth, so there is nothing to measure errors against.")
-    find = simulated_detector(
-        case.landmarks, case.truth.camera1_from[PELVIS], study.detections, procedure.seed, load_network()
-    )
-    record: dict[str, Any] = {**asdict(procedure), "kind": kind(procedure), "preset": plan.preset}
-    return record | register_case(case, plan, procedure.number, find)[0]
 
 
 def register_case(
@@ -102,7 +84,7 @@ def _measured(case: Case, scene: Scene, result: Result) -> dict[str, Any]:
         "errors": errors(truth, result.poses, points),
         "pelvis_at_head_mm": _pelvis_at_head(truth, result.poses, points),
         "displacements_mm": path_displacements(truth, result.poses, points),
-        "start_errors": {name: row for name, row in errors(truth, at_start, points).items() if name in OBJECTS},
+        "start_errors": {name: row for name, row in errors(truth, at_start, points).items() if name in _STARTED},
         "asked": _asked(truth, scene),
     }
 

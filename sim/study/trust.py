@@ -4,25 +4,39 @@ From landmarks every procedure of the accuracy study succeeds, so it cannot tell
 the capture range or beyond it, or the device beyond what its search covers.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 
-from femoreg_torch.case import read_case
+from femoreg_torch.case import Case, read_case
 from femoreg_torch.case.femoroplasty import DEVICE, PELVIS
 from femoreg_torch.case.model import Start
 from femoreg_torch.case.verdict import verdict_on
-from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation import errors, reference_points
-from femoreg_torch.files import plain, write_json
+from femoreg_torch.evaluation import ReferencePoints, errors, reference_points
+from femoreg_torch.files import plain
 from femoreg_torch.registration import Plan, prepare_scene, run_plan
 from femoreg_torch.registration.quality import Limits, assess
-from sim.study.page import machine, table, write_section
+from femoreg_torch.registration.scene import Scene
+from femoreg_torch.statistics.formats import pipe_table
+from femoreg_torch.statistics.outcome import WRONG_DEG, WRONG_MM
+from femoreg_torch.statistics.rows import VARIED
+from femoreg_torch.statistics.summary import confusion
+from sim.study.accuracy_page import confusion_cells
+from sim.study.cases import Stores
+from sim.study.code import digest
+from sim.study.conditions import Imaged, body_of, made_once
+from sim.study.page import machine, write_section
+from sim.study.procedures import Procedure
+from sim.study.record import Record
 from sim.study.starts import Offset, displaced
-from sim.study.summary import confusion
+from sim.study.store import Run
+from sim.study.study import Study
+from sim.study.trial import kind
+from sim.study.work import Setting
 
 _NONE = Offset(0, 0, 0)
 
@@ -42,55 +56,84 @@ SABOTAGES = (
     Sabotage("device 15°, 30 mm deep, 15 mm aside", _NONE, Offset(15, 30, 15)),
     Sabotage("device 30°, 60 mm deep, 30 mm aside", _NONE, Offset(30, 60, 30)),
 )
+_NAMES = [sabotage.name for sabotage in SABOTAGES]
 
 
-def sabotaged_runs(cases: Sequence[Path], plan: Plan, starts: int) -> list[dict[str, Any]]:
-    """One record per run, `starts` of every sabotage, spread evenly over the cases."""
-    records = []
-    for number, folder in enumerate(cases):
+@dataclass(frozen=True)
+class Sabotaged:
+    """Whole runs on kept cases, from the starts that their runs tell by what is varied."""
+
+    setting: Setting
+    stores: Stores
+    imaged: Imaged
+
+    def __call__(self, procedure: Procedure, scratch: Path) -> Callable[[Run], Record]:
+        setting = self.setting
+        body = body_of(procedure, self.stores, self.imaged, scratch)
+        folder = made_once(setting.variation, procedure, setting.simulation, body, self.imaged)
         case = read_case(folder)
-        if case.truth is None or DEVICE not in case.truth.camera1_from:
-            raise InputError(f"{folder}: has no truth of pelvis and device to start from.")
         scene, points = prepare_scene(case), reference_points(case)
-        for kind, sabotage in enumerate(SABOTAGES):
-            for start in range(number, starts, len(cases)):
-                generator = torch.Generator().manual_seed(1000 * kind + start)
-                centres = {name: thing.reference_point for name, thing in scene.objects.items()}
-                true = case.truth.camera1_from
-                pelvis = displaced(true[PELVIS], centres[PELVIS], sabotage.pelvis, generator)
-                device = displaced(true[DEVICE], centres[DEVICE], sabotage.device, generator)
-                objects = {**scene.objects, DEVICE: replace(scene.objects[DEVICE], start=Start(camera1_from=device))}
-                wrong = replace(scene, objects=objects)
-                outcome = run_plan(wrong, plan, pelvis, start, lambda *_: None)
-                quality = assess(wrong, outcome.poses, Limits(), plan.imaging, outcome.trace)
-                record = {
-                    "sabotage": sabotage.name,
-                    "case": folder.name,
-                    "start": start,
-                    "refused": None,
-                    "errors": errors(case.truth, outcome.poses, points),
-                    "quality": {name: asdict(value) for name, value in quality.items()},
-                    "trusted": verdict_on(tuple(outcome.poses.camera1_from), quality).trusted,
-                }
-                records.append(plain(record))
-                print(f"{folder.name}: {sabotage.name}, start {start}", flush=True)
-    return records
+        return lambda run: _sabotaged(case, scene, points, setting.plan, dict(run.varied))
 
 
-def write_trust(records: Sequence[dict[str, Any]], preset: str, out: Path, docs: Path | None) -> str:
-    """Write the records into `out`, and a section into `docs`, if given. Returns the section."""
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / f"trust_{preset}.json", {"preset": preset, "runs": list(records)})
-    rows = []
-    for sabotage in SABOTAGES:
-        counts = confusion([record for record in records if record["sabotage"] == sabotage.name])
-        rows.append([sabotage.name, *(str(value) for value in asdict(counts).values())])
+def _sabotaged(case: Case, scene: Scene, points: ReferencePoints, plan: Plan, varied: dict[str, Any]) -> Record:
+    assert case.truth is not None  # of a simulated case
+    place, start = _NAMES.index(varied["sabotage"]), varied["start"]
+    generator = torch.Generator().manual_seed(1000 * place + start)
+    true = case.truth.camera1_from
+    pelvis, device = (
+        displaced(true[name], scene.objects[name].reference_point, by, generator)
+        for name, by in ((PELVIS, SABOTAGES[place].pelvis), (DEVICE, SABOTAGES[place].device))
+    )
+    objects = {**scene.objects, DEVICE: replace(scene.objects[DEVICE], start=Start(camera1_from=device))}
+    wrong = replace(scene, objects=objects)
+    outcome = run_plan(wrong, plan, pelvis, start, lambda *_: None)
+    quality = assess(wrong, outcome.poses, Limits(), plan.imaging, outcome.trace)
+    verdict = verdict_on(tuple(outcome.poses.camera1_from), quality)
+    record = {
+        "refused": None,
+        "trusted": verdict.trusted,
+        "reasons": list(verdict.reasons),
+        "asked": list(true),
+        "errors": errors(case.truth, outcome.poses, points),
+        "quality": {name: asdict(value) for name, value in quality.items()},
+    }
+    found: Record = plain(record)
+    return found
+
+
+def plan_trust(setting: Setting, chosen: Sequence[Procedure], stores: Stores, imaged: Imaged, starts: int) -> Study:
+    """`starts` runs of every sabotage, spread evenly over the procedures."""
+    runs = [
+        Run(
+            "trust",
+            f"sabotage{number}_start{start}",
+            procedure,
+            digest(asdict(sabotage), start, setting.digest),
+            kind(procedure),
+            setting.plan.preset,
+            (("sabotage", sabotage.name), ("start", start)),
+        )
+        for place, procedure in enumerate(chosen)
+        for number, sabotage in enumerate(SABOTAGES, 1)
+        for start in range(place, starts, len(chosen))
+    ]
+    return Study(runs, Sabotaged(setting, stores, imaged))
+
+
+def write_trust(rows: pd.DataFrame, preset: str, docs: Path | None) -> str:
+    """Put the section of these runs into `docs`, if given. Returns the section."""
+    lines = []
+    for name in _NAMES:
+        counts = confusion(rows[rows[f"{VARIED}sabotage"].eq(name)])
+        assert counts is not None  # of whole runs there always is one
+        lines.append([name, *confusion_cells(counts)])
     text = "\n\n".join(
         [
-            f"`python -m sim.study trust --preset {preset}`: whole runs on "
-            f"{len({record['case'] for record in records})} simulated procedures from starts that lie so far off the "
-            "truth, in random directions. Wrong is off by more than 4 mm or 2°, as above.",
-            table(("start", "right, trusted", "right, flagged", "**wrong, trusted**", "wrong, flagged"), rows),
+            f"`python -m sim.study trust --preset {preset}`: whole runs on {rows['number'].nunique()} simulated "
+            "procedures from starts that lie so far off the truth, in random directions. Wrong is off by more than "
+            f"{WRONG_MM:g} mm or {WRONG_DEG:g}°, as above.",
+            pipe_table(("start", "right, trusted", "right, flagged", "**wrong, trusted**", "wrong, flagged"), lines),
             f"Measured on: {machine()}",
         ]
     )

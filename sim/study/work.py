@@ -26,9 +26,9 @@ from sim.study.conditions import Body, make_case, simulation_of
 from sim.study.detections import DetectionNoise, simulated_detector
 from sim.study.procedures import Procedure
 from sim.study.protocol import Protocol, Variation
+from sim.study.record import Record
 from sim.study.starts import displaced
 from sim.study.store import Run
-from sim.study.summary import Record
 from sim.study.trial import first_views, register_case
 from sim.theatre.settings import Simulation
 
@@ -61,11 +61,12 @@ class Setting:
 def settings_of(protocol: Protocol, name: str) -> dict[str, Setting]:
     """The conditions of a protocol by name. Raises `InputError` for a preset that is not there or does not fit."""
     base = load_preset("simulation", protocol.simulation)
+    plans = {preset: load_plan(preset) for preset in {v.preset or protocol.preset for v in protocol.vary}}
     found = {}
     for variation in protocol.vary:
         where = f"study {name}, {variation.name}"
         read_record(Simulation, simulation_of(variation, base), where)
-        plan = load_plan(variation.preset or protocol.preset)
+        plan = plans[variation.preset or protocol.preset]
         detections = variation.detections or protocol.detections
         found[variation.name] = Setting(variation, plan, base, detections, protocol.closed_loop)
     return found

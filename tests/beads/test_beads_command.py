@@ -109,7 +109,9 @@ def folder(tmp_path: Path) -> Path:
     return place
 
 
-def test_beads_give_the_truth_and_are_taken_out(folder: Path, tmp_path: Path) -> None:
+def test_beads_give_the_truth_and_are_taken_out(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "trials" / "I"
     assert main(["beads", str(folder), "--beads", str(folder / "beads.yaml"), "--out", str(out)]) == 0
     case = read_case(out)
@@ -146,9 +148,18 @@ def test_beads_give_the_truth_and_are_taken_out(folder: Path, tmp_path: Path) ->
         assert trial.errors["entry_point_mm"] == pytest.approx(offset, abs=1e-6)
         assert trial.errors["relative_mm"] == pytest.approx(offset, abs=1e-6)
         assert trial.truth["entry_point_mm"] > 0.05
-    assert main(["beads-table", str(tmp_path / "trials"), "--out", str(tmp_path / "rows.csv")]) == 0
-    (row,) = csv.DictReader((tmp_path / "rows.csv").open(encoding="utf-8"))
-    assert row["trial"] == "I"
+    capsys.readouterr()
+    assert main(["beads-table", str(tmp_path / "trials")]) == 0
+    printed = capsys.readouterr().out
+    assert main(["tables", str(tmp_path / "trials")]) == 0  # the same table, from what the other command has written
+    assert [line for line in printed.splitlines() if "mm" in line][:3] == [
+        line for line in capsys.readouterr().out.splitlines() if "mm" in line
+    ][:3]
+    rows = list(csv.DictReader((tmp_path / "trials" / "tables" / "trials.csv").open(encoding="utf-8")))
+    assert {row["trial"] for row in rows} == {"I"}
+    entry, *_ = rows
+    assert float(entry["value"]) == pytest.approx(0, abs=1e-6)
+    assert float(entry["beads_alone"]) == pytest.approx(trial.truth["entry_point_mm"])
 
 
 @pytest.mark.parametrize(

@@ -169,6 +169,17 @@ def test_trials_stand_side_by_side_with_the_papers_below() -> None:
     assert table.rows[place + 1][1:] == ("2.64 ± 1.10", "1.98", "2.88", "3.44", "1.32", "1.94", "4.28")
 
 
+def test_trials_tell_what_their_beads_leave_open() -> None:
+    rows = pd.concat([made_up(1, seed=n, condition=f"T{n}") for n in range(2)], ignore_index=True)
+    rows["beads_tip_mm"] = [3.0, 4.0]
+    rows["trusted"] = [True, False]
+    table = trial_table(rows)
+    assert table.columns[2:5] == ("T0", "T1 *", "")
+    place = [row[0] for row in table.rows].index("guide tip, mm")
+    assert table.rows[place + 1][:4] == ("beads alone", "3.54 rms", "3.00", "4.00")
+    assert sum(row[0] == "beads alone" for row in table.rows) == 1
+
+
 def test_cells() -> None:
     assert [number(v, 2) for v in (math.nan, math.inf, -1.0)] == ["–", "∞", "−1.00"]
     assert number(1.0, 1, "+") == "+1.0"

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from lightning.pytorch.callbacks import RichProgressBar, TQDMProgressBar
+from rich.console import Console
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import load_network
@@ -16,7 +18,7 @@ from models.weights import Weights, save_weights
 from training.commands import train
 from training.data import ViewBatches
 from training.devices import read_devices
-from training.run import begin_with
+from training.run import begin_with, progress_bar
 from training.settings import read_settings
 
 LANDMARKS, CLASSES = len(HIP.landmarks), 1 + len(HIP.bones)
@@ -181,3 +183,8 @@ def test_a_deeper_network_begins_as_the_shallower_one(settings: str, tmp_path: P
     for other in (replace(shallow, channels=(8, 12, 24)), replace(shallow, convolutions=(2, 1, 1))):
         with pytest.raises(InputError, match="is not that of these weights"):
             begin_with(path, other.build())
+
+
+def test_a_notebook_gets_a_bar_that_works_there() -> None:
+    assert isinstance(progress_bar(Console(force_jupyter=True)), TQDMProgressBar)
+    assert isinstance(progress_bar(Console(force_jupyter=False)), RichProgressBar)

@@ -19,7 +19,7 @@ from femoreg_torch.fluoro import read_image
 from femoreg_torch.geometry import Poses, invert_rigid, rotation_angle, transform_points
 from sim.study.closed_loop import ClosedLoop, run_rounds
 from sim.study.conditions import Body, Condition
-from sim.study.summary import Record
+from sim.study.record import Record
 
 TRUSTED = ObjectQuality((), 0.0, (0.0, 0.0), (0.1,) * 3, (0.1,) * 3, None, True, "all views agree")
 Register = Callable[[Path, dict[str, Tensor] | None], tuple[Record, Result | None]]

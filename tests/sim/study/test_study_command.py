@@ -48,7 +48,7 @@ def test_a_failed_run_is_told_and_the_status_says_so(tmp_path: Path, capsys: pyt
         (["paper", "-n", "0"], "--procedures: at least 1"),
         (["paper", "-n", "many"], "many"),
         (["paper", "--jobs", "0"], "--jobs: at least 1"),
-        (["accuracy"], "has no `vary`"),
+        (["cadaver"], "has no `vary`"),
         (["paper", "--data", "nowhere"], "nowhere/meshes/bmf.npz"),
     ],
 )

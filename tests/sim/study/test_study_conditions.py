@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import yaml
 from coarse import PROCEDURE, SIMULATION, stores_in
+from femoreg_torch.configs import load_preset
 
 from femoreg_torch.case import read_case
 from femoreg_torch.case.femoroplasty import device_of
@@ -17,15 +19,17 @@ from femoreg_torch.geometry import rotation_angle, transform_points
 from femoreg_torch.volume import read_ct, read_mesh
 from sim.study import conditions as module
 from sim.study.cases import Stores
-from sim.study.conditions import Condition, Imaged, image_procedure, make_conditions, read_conditions
-from sim.study.procedures import Study, load_study
+from sim.study.conditions import Condition, Imaged, body_of, made_once, make_conditions
+from sim.study.protocol import load_protocol
+from sim.study.work import settings_of
+from sim.study.yardsticks import only_these
 from sim.theatre.case_folders import write_simulation
 from sim.theatre.metal import draw_materials
 from sim.theatre.preoperative_case import read_preoperative
 from sim.theatre.procedure import draw_procedure
 from sim.theatre.settings import load_simulation
 
-CONDITIONS = read_conditions("conditions")
+CONDITIONS = load_protocol("conditions").vary
 
 
 @pytest.fixture(scope="module")
@@ -34,15 +38,17 @@ def stores(coarse_root: Path) -> Stores:
 
 
 @pytest.fixture(scope="module")
-def study(stores: Stores) -> Study:
-    """That of the accuracy study, with 16 × 16 pixels of the C-arm in one."""
-    return replace(load_study("accuracy"), acquisition=str(stores.cases.parent / SIMULATION))
+def simulation(stores: Stores) -> dict[str, Any]:
+    """The settings of the paper, with 16 × 16 pixels of the C-arm in one."""
+    return load_preset("simulation", stores.cases.parent / SIMULATION)
 
 
 @pytest.fixture(scope="module")
-def imaged(stores: Stores, study: Study) -> Imaged:
+def imaged(stores: Stores, simulation: dict[str, Any]) -> Imaged:
     out = Imaged(stores.cases.parent / "bodies", stores.cases.parent / "conditions")
-    image_procedure(PROCEDURE, CONDITIONS, study, stores, out, lambda _: None)
+    body = body_of(PROCEDURE, stores, out, stores.cases.parent)
+    for condition in CONDITIONS:
+        made_once(condition, PROCEDURE, simulation, body, out)
     return out
 
 
@@ -54,11 +60,10 @@ def shown(imaged: Imaged, name: str, kind: str = "device", view: int = 0) -> tor
     return read_image(read_case(folder_of(imaged, name)).views[view].images[kind]).float()
 
 
-def test_the_condition_uniform_is_the_study_bit_for_bit(
-    imaged: Imaged, stores: Stores, study: Study, tmp_path: Path
-) -> None:
+def test_the_condition_uniform_is_the_study_bit_for_bit(imaged: Imaged, stores: Stores, tmp_path: Path) -> None:
     coarse, finer = (stores.patients / "somebody" / name for name in ("1.0", "0.5"))
-    write_simulation(coarse, tmp_path / "case", 2, "right", study.acquisition, lambda _: None, finer)
+    config = str(stores.cases.parent / SIMULATION)
+    write_simulation(coarse, tmp_path / "case", 2, "right", config, lambda _: None, finer)
     for name in ("view1.tif", "view3.tif", "view2_device.tif", "truth.json", "case.yaml", "device.stl"):
         assert (tmp_path / "case" / name).read_bytes() == (folder_of(imaged, "uniform") / name).read_bytes()
 
@@ -76,15 +81,15 @@ def test_every_condition_has_its_case(imaged: Imaged) -> None:
 
 
 def test_the_rays_through_the_patient_are_cast_once_and_again_where_it_moved(
-    imaged: Imaged, stores: Stores, study: Study, monkeypatch: pytest.MonkeyPatch
+    imaged: Imaged, stores: Stores, simulation: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert len(list((imaged.bodies / PROCEDURE.name).glob("*.pt"))) == 6
     monkeypatch.delattr(module, "areal_posed_tissue")  # nothing is cast any more
     later = Condition("later", xray={"kvp": 90})
-    image_procedure(PROCEDURE, [later], study, stores, imaged, lambda _: None)
+    make_conditions([PROCEDURE], [later], simulation, stores, imaged, 1)
     assert shown(imaged, "later").shape == (96, 96)
     again = replace(imaged, conditions=imaged.conditions.parent / "again")
-    make_conditions([PROCEDURE], [CONDITIONS[0]], study, stores, again, 1)
+    make_conditions([PROCEDURE], [CONDITIONS[0]], simulation, stores, again, 1)
     name = "view2_device.tif"
     assert (folder_of(again, "uniform") / name).read_bytes() == (folder_of(imaged, "uniform") / name).read_bytes()
 
@@ -168,11 +173,13 @@ def test_the_patient_moves_by_just_so_much_between_the_images(stores: Stores, tm
 
 
 def test_another_condition_of_a_name_and_an_unknown_name_are_refused(
-    imaged: Imaged, stores: Stores, study: Study
+    imaged: Imaged, stores: Stores, simulation: dict[str, Any]
 ) -> None:
     other = Condition("uniform", xray={"kvp": 60})
     with pytest.raises(InputError, match="other settings"):
-        image_procedure(PROCEDURE, [other], study, stores, imaged, lambda _: None)
-    with pytest.raises(InputError, match="no 'fog'"):
-        read_conditions("conditions", ["fog"])
-    assert [condition.name for condition in read_conditions("conditions", ["moved", "dark"])] == ["dark", "moved"]
+        make_conditions([PROCEDURE], [other], simulation, stores, imaged, 1)
+    settings = settings_of(load_protocol("conditions"), "conditions")
+    with pytest.raises(InputError, match="no 'fog'; there are: uniform, "):
+        only_these(settings, ["fog"], "conditions")
+    assert list(only_these(settings, ["moved", "dark"], "conditions")) == ["dark", "moved"]
+    assert only_these(settings, [], "conditions") == settings

@@ -3,6 +3,8 @@
 import errno
 import os
 import signal
+import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from multiprocessing import get_context
@@ -15,7 +17,8 @@ import pytest
 from cheap_study import Cheap, command, study
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import write_json
+from femoreg_torch.files import read_json, write_json
+from sim.study import owner
 from sim.study import store as module
 from sim.study import study as study_module
 from sim.study.executors import OnThisMachine
@@ -213,17 +216,86 @@ def test_a_damaged_record_is_made_anew(tmp_path: Path) -> None:
 
 
 def test_two_commands_do_not_share_a_folder(tmp_path: Path) -> None:
-    with Store(tmp_path, "code").in_charge(), pytest.raises(InputError, match="another `femoreg study`"):
+    with Store(tmp_path, "code").in_charge(), pytest.raises(InputError, match=r"another command .*process") as told:
         run_study(study(3, Cheap()), tmp_path, HERE)
+    assert "\n" not in str(told.value)
+    assert list(tmp_path.iterdir()) == []
+    run_study(study(3, Cheap()), tmp_path, HERE)
+    assert not (tmp_path / owner.NAME).exists()
 
 
 def test_scratch_of_killed_processes_is_removed_and_that_of_live_ones_is_not(tmp_path: Path) -> None:
     store = Store(tmp_path, "code")
     store.prepare()
     with store.scratch(4) as live:
-        killed = tmp_path / "scratch" / "00005-killed"
-        killed.mkdir()
-        (killed / ".lock").touch()
-        assert store.clear_killed() == {5}
-        assert live.is_dir()
-        assert not killed.exists()
+        for number, changes in ((5, {"process": ended()}), (6, {"started": 0.0}), (7, {"machine": "another"})):
+            left = tmp_path / "scratch" / f"{number:05d}-left"
+            left.mkdir()
+            write_json(left / owner.NAME, read_json(live / owner.NAME) | changes)
+        assert store.clear_killed() == {5, 6}
+        os.utime(left, (0, 0))
+        assert store.clear_killed() == {7}
+        assert [path.name for path in (tmp_path / "scratch").iterdir()] == [live.name]
+
+
+def ended() -> int:
+    """The number of a process that has come to its end."""
+    process = subprocess.Popen(["true"])
+    process.wait()
+    return process.pid
+
+
+def test_a_folder_of_a_killed_command_is_taken_over(tmp_path: Path) -> None:
+    store, path = Store(tmp_path, "code"), tmp_path / owner.NAME
+    with store.in_charge():
+        mine = read_json(path)
+    write_json(path, mine | {"process": ended()})
+    with store.in_charge():
+        assert read_json(path)["process"] == os.getpid()
+    write_json(path, mine | {"machine": "another", "host": "another"})
+    with pytest.raises(InputError, match=r"on another.* 2 minutes"), store.in_charge():
+        pass
+    long_ago = time.time() - owner.GONE_S - 1
+    os.utime(path, (long_ago, long_ago))
+    with store.in_charge():
+        assert read_json(path)["machine"] == mine["machine"]
+    path.touch()  # just made, and not written yet
+    with pytest.raises(InputError, match="another command"), store.in_charge():
+        pass
+
+
+def test_of_many_commands_at_the_same_time_one_gets_the_folder(tmp_path: Path) -> None:
+    write_json(tmp_path / owner.NAME, {"machine": owner._machine(), "process": ended(), "started": 0.0})
+    inside, most, got = [], [], []
+    together = threading.Barrier(8)
+
+    def try_it() -> None:
+        together.wait()
+        try:
+            with Store(tmp_path, "code").in_charge():
+                inside.append(1)
+                most.append(len(inside))
+                time.sleep(0.05)
+                inside.pop()
+                got.append(1)
+        except InputError:
+            pass
+
+    threads = [threading.Thread(target=try_it) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert got
+    assert max(most) == 1
+
+
+def test_an_owner_that_lives_is_heard_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(owner, "BEAT_S", 0.01)
+    path = tmp_path / owner.NAME
+    with Store(tmp_path, "code").in_charge():
+        os.utime(path, (0, 0))
+        until = time.monotonic() + 60
+        while path.stat().st_mtime == 0:
+            assert time.monotonic() < until
+            time.sleep(0.01)

@@ -1,19 +1,30 @@
 """Processes that die take nothing with them but the run that ends them; a Dask cluster gives the same rows."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import pytest
 from cheap_study import Cheap, study
+from joblib import delayed
 
 from femoreg_torch.errors import InputError
 from sim.study.executors import OnCluster, OnThisMachine
+from sim.study.processes import in_processes
 from sim.study.rows import TABLE_NAME, comparable, read_table
 from sim.study.study import run_study
 
 
 def rows(out: Path) -> list[Any]:
     return comparable(read_table(out / TABLE_NAME))
+
+
+def test_what_joblib_says_of_its_own_workers_does_not_reach_the_user() -> None:
+    replaced = "A worker stopped while some jobs were given to the executor. This can be caused by a too short timeout."
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        list(in_processes(1, [delayed(warnings.warn)(text, UserWarning) for text in (replaced, "something else")]))
+    assert [str(warning.message) for warning in told] == ["something else"]
 
 
 @pytest.mark.long

@@ -8,10 +8,12 @@ import yaml
 from femoreg_torch.configs import load_preset, preset_names
 
 from femoreg_torch.errors import InputError
-from sim.study.procedures import load_study, procedures
+from femoreg_torch.settings import read_record
+from sim.study.conditions import simulation_of
 from sim.study.protocol import Protocol, load_protocol, varied
 from sim.study.study import plan_study
-from sim.study.work import settings_of
+from sim.study.work import Simulated, settings_of
+from sim.theatre.settings import Simulation
 
 PROTOCOLS = [name for name in preset_names("study") if "vary" in load_preset("study", name)]
 
@@ -40,6 +42,47 @@ def test_the_protocols_that_are_promised_are_there() -> None:
     assert load_protocol("paper").procedures == 1000
 
 
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_the_first_run_of_every_preset_can_be_set_up(name: str, tmp_path: Path) -> None:
+    """All that a run needs is read and checked before anything is simulated."""
+    if "cases" in load_preset("study", name):
+        pytest.skip("its cases are the user's")
+    plan = plan_study(name, 1, tmp_path, None, False)
+    assert isinstance(plan.work, Simulated)
+    run, *others = plan.runs
+    assert (run.procedure.number, run.kind, len(others)) == (1, "procedural", len(plan.work.settings) - 1)
+    setting = plan.work.settings[run.condition]
+    content = simulation_of(setting.variation, setting.simulation)
+    assert read_record(Simulation, content, name).acquisition.step_mm > 0
+    assert setting.plan.steps
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_procedures_of_the_accuracy_page_are_a_protocol(tmp_path: Path) -> None:
+    protocol = load_protocol("accuracy")
+    everything = protocol.first(60, real=True)
+    assert len(everything) == 60
+    assert everything == load_protocol("conditions").first(60, real=True)
+    assert len({p.seed for p in everything}) == len({p.name for p in everything}) == 60
+    assert (everything[0].name, everything[1].name, everything[41].name) == (
+        "01_301_left",
+        "02_bmf_right",
+        "42_z013_left",
+    )
+    procedural = [p for p in everything if p.procedural]
+    assert protocol.first(60, real=False) == procedural
+    assert len({p.patient for p in procedural}) == 30
+    for part in (everything, procedural, everything[:20]):
+        assert sum(p.side == "left" for p in part) == len(part) / 2
+    for subject in protocol.bones:
+        of_it = [p for p in everything if p.patient == subject]
+        assert len(of_it) == 5
+        assert {p.side for p in of_it} == {"left", "right"}
+    assert {p.patient for p in everything[:20]} >= set(protocol.bones)
+    with pytest.raises(InputError, match="has 30 procedures, 31"):
+        plan_study("accuracy", 31, tmp_path, None, False)
+
+
 @pytest.mark.parametrize("real", [False, True])
 def test_a_procedure_is_the_same_however_many_are_asked_for(real: bool) -> None:
     protocol = load_protocol("paper")
@@ -59,7 +102,7 @@ def test_the_patients_are_nobody_that_was_trained_on_or_measured_with() -> None:
     training = load_preset("training", "hip14")
     told = yaml.safe_dump(training)
     known = {int(word) for word in told.replace("[", " ").replace(",", " ").replace("]", " ").split() if word.isdigit()}
-    known |= {int(p.patient) for p in procedures(load_study("accuracy")) if p.procedural}
+    known |= {int(p.patient) for p in load_protocol("accuracy").first(60, real=True) if p.procedural}
     assert {1, 7, 101, 301, 330} <= known
     assert not patients & known
     assert min(patients) > 10000

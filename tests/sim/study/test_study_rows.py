@@ -3,16 +3,17 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pytest
 from cheap_study import Cheap, study
 
+from femoreg_torch.statistics.summary import coverage
 from sim.study.executors import OnThisMachine
-from sim.study.rows import TABLE_NAME, read_table, rows_of, table_of
+from sim.study.rows import TABLE_NAME, frame_of, read_table, rows_of, table_of
 from sim.study.store import Store
 from sim.study.study import run_study
-from sim.study.summary import coverage, rows_of_csv
 
 HEAD = ["study", "condition", "number", "patient", "kind", "side", "seed", "preset", "code", "settings"]
 
@@ -62,23 +63,23 @@ def test_a_first_run_that_tells_little_leaves_the_columns_in_their_order(records
     assert names.index("pelvis_mm") < names.index("evaluations_pelvis_in_view_1") < names.index("seconds_run")
 
 
-def test_errors_are_named_and_signed_as_in_the_csv(records: list[dict[str, Any]]) -> None:
-    for record, old in zip(records, rows_of_csv(records), strict=True):
-        (row,) = rows_of(record)
-        for name in set(old) - {"refused", "reason"}:
-            assert row[name] == old[name]
+def test_errors_are_named_and_signed(records: list[dict[str, Any]]) -> None:
+    (row,) = rows_of(records[0])
+    error = records[0]["errors"]["pelvis"]
+    assert row["pelvis_mm"] == error["mm"]
+    assert [row[f"pelvis_deg_{axis}"] for axis in ("is", "lr", "ap")] == error["deg_xyz"]
+    assert row["tip_mm"] == records[0]["errors"]["tip_mm"]
+    assert row["start_pelvis_deg"] == records[0]["start_errors"]["pelvis"]["deg"]
 
 
 def test_deviations_lie_along_the_axes_of_the_errors(records: list[dict[str, Any]]) -> None:
-    """Counting what lies within them gives what `coverage` does, which knows the camera's axes."""
+    """Deviations are told along the camera's x, y and z, errors along IS (−y), LR (x) and AP (z)."""
     done = [record for record in records if record["refused"] is None]
-    frame = table_of(done).to_pandas()
-    for name, unit, found in coverage(done):
-        within = [
-            (frame[f"{name}_{unit}_{axis}"].abs() <= frame[f"{name}_sigma_{unit}_{axis}"]).mean()
-            for axis in ("is", "lr", "ap")
-        ]
-        assert within == pytest.approx(found.within_1)
+    found = {(c.object, c.unit): c for c in coverage(frame_of(records))}
+    for unit, key in (("mm", "translation_deviation_mm"), ("deg", "rotation_deviation_deg")):
+        errors = np.abs([record["errors"]["pelvis"][f"{unit}_xyz"] for record in done])
+        stated = np.array([record["quality"]["pelvis"][key] for record in done])[:, [1, 0, 2]]
+        assert [rate.share for rate in found["pelvis", unit].within_1] == pytest.approx((errors <= stated).mean(0))
 
 
 def test_types_hold_what_all_rows_have(records: list[dict[str, Any]], tmp_path: Path) -> None:

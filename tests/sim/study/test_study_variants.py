@@ -8,9 +8,9 @@ import torch
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import rotation_angle, transform_points
 from femoreg_torch.registration import OrbitSearch, Stage, load_plan
+from femoreg_torch.statistics.intervals import rate_interval
 from sim.study.ablation import Variant, plan_of, read_variants
 from sim.study.capture import LEVELS, first_stages, offset, success_rates
-from sim.study.figures import rate_interval
 from sim.study.starts import displaced
 
 POSE = torch.tensor([[1, 0, 0, 5], [0, 0, -1, -8], [0, 1, 0, 760], [0, 0, 0, 1]], dtype=torch.float64)

@@ -1,0 +1,96 @@
+"""The accuracy page's procedures and conditions are studies of the engine, on cases that are made once and kept."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cheap_study import Cheap, study
+from coarse import PROCEDURE, SIMULATION, stores_in
+
+from femoreg_torch.files import write_json
+from sim.study import __main__ as command
+from sim.study.conditions import Imaged, body_of, made_once
+from sim.study.executors import OnThisMachine
+from sim.study.protocol import load_protocol
+from sim.study.rows import TABLE_NAME, comparable, read_table
+from sim.study.study import run_study
+from sim.study.work import settings_of
+from sim.study.yardsticks import plan_yardstick, take_earlier
+
+
+def test_cases_are_made_once_and_runs_are_kept(coarse_root: Path, tmp_path: Path) -> None:
+    protocol = replace(load_protocol("accuracy"), simulation=str(coarse_root / SIMULATION))
+    (setting,) = settings_of(protocol, "accuracy").values()
+    start_alone = {"uniform": replace(setting, plan=replace(setting.plan, steps=()))}
+    imaged, out = Imaged(None, tmp_path / "conditions"), tmp_path / "fast"
+    plan = plan_yardstick("accuracy", protocol, start_alone, [PROCEDURE], stores_in(coarse_root), imaged, out)
+    assert run_study(plan, out, OnThisMachine(1)).status == {"done": 1}
+    (row,) = comparable(read_table(out / TABLE_NAME))
+    assert (row["study"], row["condition"], row["number"], row["seed"]) == ("accuracy", "uniform", 1, PROCEDURE.seed)
+    assert row["femur_mm"] > 0
+    image = tmp_path / "conditions" / "uniform" / PROCEDURE.name / "view1.tif"
+    made_at = image.stat().st_mtime_ns
+    told: list[tuple[int, int, int]] = []
+    run_study(plan, out, OnThisMachine(1), begin=lambda *counts: told.append(counts))
+    assert told == [(0, 1, 0)]
+    body = body_of(PROCEDURE, stores_in(coarse_root), imaged, tmp_path)
+    assert made_once(setting.variation, PROCEDURE, setting.simulation, body, imaged) == image.parent
+    assert image.stat().st_mtime_ns == made_at
+
+
+@pytest.fixture
+def earlier(tmp_path: Path) -> Path:
+    """What versions before the engine wrote: of procedures 1 to 3 of a study, the third of another seed."""
+    for run in study(3, Cheap()).runs:
+        number = run.procedure.number
+        content: dict[str, Any] = {
+            "number": number,
+            "patient": run.procedure.patient,
+            "side": run.procedure.side,
+            "seed": run.procedure.seed + (number == 3),
+            "kind": "procedural",
+            "preset": "fast",
+            "code": "an earlier one",
+            "refused": "too dark" if number == 2 else None,
+            "trusted": number == 1,
+            "reasons": [],
+        }
+        if number == 1:
+            content["errors"] = {"pelvis": {"mm": 0.5, "deg": 0.1, "mm_xyz": [0.5, 0, 0], "deg_xyz": [0.1, 0, 0]}}
+        (tmp_path / "old").mkdir(exist_ok=True)
+        write_json(tmp_path / "old" / f"{run.procedure.name}.json", content)
+    return tmp_path / "old"
+
+
+def test_what_earlier_versions_have_measured_is_taken_over_where_it_is_asked_for(earlier: Path, tmp_path: Path) -> None:
+    plan, out = study(3, Cheap()), tmp_path / "out"
+    assert take_earlier(plan, out, lambda run: earlier / f"{run.procedure.name}.json") == 2
+    assert take_earlier(plan, out, lambda run: earlier / f"{run.procedure.name}.json") == 0
+    told: list[tuple[int, int, int]] = []
+    run_study(plan, out, OnThisMachine(1), reuse=True, begin=lambda *counts: told.append(counts))
+    assert told == [(1, 2, 0)]
+    first, second, third = comparable(read_table(out / TABLE_NAME))
+    assert (first["code"], first["status"], first["pelvis_mm"]) == ("an earlier one", "done", 0.5)
+    assert (second["status"], second["reason"]) == ("refused", "too dark")
+    assert third["code"] != "an earlier one"
+    run_study(plan, out, OnThisMachine(1), begin=lambda *counts: told.append(counts))
+    assert told[1] == (2, 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["conditions", "--only", "uniform,fog"], "no 'fog'"),
+        (["accuracy", "--preset", "quickest"], "no registration preset 'quickest'"),
+        (["accuracy", "--first", "2", "--data", "nowhere"], "bmf.npz: there is no such file"),
+    ],
+)
+def test_bad_input_is_one_line_and_no_run_is_made(
+    options: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.main([*options, "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert says in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.glob("*/runs/*"))
