@@ -13,6 +13,7 @@ from typing import Any
 import pandas as pd
 import torch
 import yaml
+from torch import Tensor
 
 from femoreg_torch.case import read_case
 from femoreg_torch.case.femoroplasty import DEVICE, PELVIS
@@ -53,8 +54,7 @@ from sim.study.information import Information, bound, known_before, shares_of_in
 from sim.study.procedures import Procedure
 from sim.study.protocol import Protocol, load_protocol
 from sim.study.responses import error_responses, view_block
-from sim.study.rows import read_table
-from sim.study.summary import flat_errors
+from sim.study.rows import flat_errors, read_table
 from sim.study.work import Setting, settings_of
 from sim.theatre.images import posed_tissue
 from sim.theatre.metal import metal_in_beam

@@ -21,7 +21,7 @@ from femoreg_torch.volume import Volume, axis_aligned
 from sim.study.exposures import Drawn, drawn_images, with_noise
 from sim.study.information import Bound, bound, image_information, known_before, shares_of_information
 from sim.study.responses import centres_in, error_responses
-from sim.study.summary import flat_errors
+from sim.study.rows import flat_errors
 
 CARM = CArm(centred_camera(1000.0, (3.2, 3.2), (96, 96)), (0.0, 0.0, 640.0), (0.0, 1.0, 0.0))
 POSES = ("pelvis", "femur", "device", "view2", "view3")
