@@ -138,6 +138,22 @@ class Surroundings:
         return np.asarray(directions[int(depth.min(1).argmax())])
 
 
+def central_path(around: Surroundings, volume_ml: float, settings: PathSettings) -> Path:
+    """The path without a plan: along the neck's axis to the head's centre, a third of the cement at each quarter.
+
+    What a planned path is compared with (choice). Raises `InputError` if the axis of the neck does not leave the bone.
+    """
+    target = around.frame.head
+    entry = around.entry(target, around.neck)
+    if entry is None:
+        raise InputError("path: the axis of the neck does not leave the bone. Check label and head centre.")
+    length = float(np.linalg.norm(target - entry))
+    axis = settings.least_axis_mm
+    return Path(
+        entry, target, tuple(Ellipsoid(length * share, axis, axis, volume_ml / 3) for share in (0.75, 0.5, 0.25))
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Worth:
     """Places in the marrow: where (N, 3), LPS mm, how much cement each takes (ml), what it is worth per ml."""

@@ -59,19 +59,20 @@ def make_plan(
     worth = places(bone, prepared.model.grid.spread(optimum.worth))
     planner = Planner(around, worth, volume_ml, planning.path)
     x = planner.search(rng, lambda share: progress("path", 0.6 + 0.2 * share))
-    path, cement, curve = _tried(prepared, planner, x)
+    short = until_yield(prepared)
+    path, cement, curve = _tried(short, planner, x)
     loads = [curve.yield_load_n]
     for n in range(planning.path.polish):
         progress("last changes of the path", 0.8 + 0.2 * n / planning.path.polish)
         changed = _nudged(planner, x, rng)
         if changed is None:
             break
-        other, other_cement, other_curve = _tried(prepared, planner, changed)
+        other, other_cement, other_curve = _tried(short, planner, changed)
         loads.append(other_curve.yield_load_n)
         if other_curve.yield_load_n > curve.yield_load_n:
             x, path, cement, curve = changed, other, other_cement, other_curve
     clearances = around.clearances(path, planning.path)
-    return FemoroplastyPlan(volume_ml, optimum, path, clearances, cement, curve, tuple(loads))
+    return FemoroplastyPlan(volume_ml, optimum, path, clearances, cement, prepared.curve(cement), tuple(loads))
 
 
 def _tried(prepared: Prepared, planner: Planner, x: Array) -> tuple[Path, Array, Curve]:

@@ -1,4 +1,4 @@
-"""`python -m sim.study COMMAND …`: the measurements behind `docs/accuracy.md`; see the Makefile."""
+"""`python -m sim.study COMMAND …`: measures what `docs/accuracy.md` and `docs/planning.md` tell; see the Makefile."""
 
 import os
 import sys
@@ -14,9 +14,11 @@ from femoreg_torch.registration import load_plan
 from sim.study import ablation as variants
 from sim.study import accuracy as measurement
 from sim.study import capture
+from sim.study import plans as planning
 from sim.study.cases import Stores, ready
 from sim.study.conditions import Imaged, make_conditions, read_conditions
 from sim.study.conditions_page import write_conditions
+from sim.study.plans_page import write_plans
 from sim.study.procedures import Procedure, Study, load_study, procedures
 from sim.study.timing import time_register
 from sim.study.trust import sabotaged_runs, write_trust
@@ -226,6 +228,32 @@ def conditions(
     print(write_conditions(runs, preset, first, command, folder, docs))
 
 
+def plans(
+    first: int | None = None,
+    meshes: bool = True,
+    out: Path = Path("out/plans"),
+    data: Path = _DATA,
+    docs: Path | None = None,
+) -> None:
+    """Plan cement for three femora, move the plans, compare meshes; goes on where it was stopped.
+
+    Args:
+        first: only the first so many femora.
+        meshes: compare meshes on the first femur.
+        out: folder of cases and plans, and of what was measured so far.
+        data: folder with the real CTs in ct/; the environment's FEMOREG_DATA, if set.
+        docs: folder of the page that is to be renewed, with all that was measured so far.
+    """
+    for number, subject in enumerate(planning.SUBJECTS[:first]):
+        print(subject.title, flush=True)
+        planning.measure(subject, out, data)
+        if meshes and number == 0:
+            planning.compare_meshes(subject, out)
+    if docs is not None:
+        found = [known for subject in planning.SUBJECTS if (known := planning.measured(subject, out)) is not None]
+        print(write_plans(found, "make plans", docs))
+
+
 def listing(first: int | None = None, kind: Kind = "all", out: Path = _OUT) -> None:
     """Which procedures the study has, and which of their cases are there.
 
@@ -256,6 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "trust": trust,
         "ablation": ablation,
         "conditions": conditions,
+        "plans": plans,
         "list": listing,
     }
     try:

@@ -13,15 +13,18 @@ import trimesh
 from pyarrow import parquet, table
 from scipy import ndimage
 
-from femoreg_torch.case import Case, read_case
+from femoreg_torch.case import Case, ObjectQuality, Result, read_case, write_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
+from femoreg_torch.evaluation.planning_section import planning_section
 from femoreg_torch.files import write_json
-from femoreg_torch.planning.offsets import carried_out, directions, normal_offsets, study_offsets
-from femoreg_torch.planning.path import Ellipsoid, Path, Planner, Surroundings, Worth, covered, places
+from femoreg_torch.geometry import Poses
+from femoreg_torch.planning.offsets import carried_out, directions, turned_ends
+from femoreg_torch.planning.path import Ellipsoid, Path, Planner, Surroundings, Worth, central_path, covered, places
 from femoreg_torch.planning.plan import FemoroplastyPlan, make_plan
 from femoreg_torch.planning.prepare import Prepared, prepare
 from femoreg_torch.planning.report import read_plan, write_plan
+from femoreg_torch.planning.response import Response, read_response, response_content
 from femoreg_torch.planning.settings import Planning, load_planning
 from femoreg_torch.volume import Volume, read_label_map, write_landmarks, write_volume
 
@@ -34,6 +37,7 @@ diffusion: {voxel_mm: 3}
 offsets: {distance_mm: 4}
 """
 ML = 6.0
+ENDS = {"end superior", "end inferior", "end anterior", "end posterior"}
 SIX = {"superior", "inferior", "anterior", "posterior", "medial", "lateral"}
 
 
@@ -154,38 +158,12 @@ def test_offsets_move_along_the_patient_and_not_moved_is_as_planned(prepared: Pr
     np.testing.assert_array_equal(directions("left")["medial"], -directions("right")["medial"])
     around = Surroundings(prepared.bone)
     for moves in ("path", "pattern"):
-        still = carried_out(prepared, around, plan.path, plan.cement, np.zeros(3), moves)  # type: ignore[arg-type]
+        still = carried_out(prepared, around, plan.path, plan.cement, np.zeros(6), moves)  # type: ignore[arg-type]
         assert still.yield_load_n == pytest.approx(plan.curve.yield_load_n, rel=1e-9)
     assert still.clearance_mm == pytest.approx(plan.clearances.cortex_mm)
-    away = np.array([0.0, 80.0, 0.0])
+    away = np.array([0.0, 80.0, 0.0, 0.0, 0.0, 0.0])
     with pytest.raises(InputError, match="the path leaves the bone"):
         carried_out(prepared, around, plan.path, plan.cement, away, "path")
-
-
-def test_random_offsets_have_their_mean_and_covariance(tmp_path: File) -> None:
-    covariance = np.array([[1.0, 0.3, 0], [0.3, 2, 0], [0, 0, 0.5]])
-    drawn = normal_offsets(np.array([1.0, -2, 0]), covariance, 20000, 0)
-    np.testing.assert_allclose(drawn.mean(0), [1, -2, 0], atol=0.05)
-    np.testing.assert_allclose(np.cov(drawn.T), covariance, atol=0.06)
-    with pytest.raises(InputError, match="symmetric 3 × 3"):
-        normal_offsets(np.zeros(3), -np.eye(3), 5, 0)
-
-
-@pytest.mark.parametrize("suffix", ["parquet", "csv"])
-def test_offsets_of_a_study_are_those_of_its_trusted_runs(tmp_path: File, suffix: str) -> None:
-    columns: dict[str, Any] = {
-        f"femur_mm_{axis}": [n, 9.0, n] for axis, n in zip(("lr", "ap", "is"), (1.0, 2.0, 3.0), strict=True)
-    }
-    columns |= {f"device_mm_{axis}": [0.5, 9.0, 0.5] for axis in ("lr", "ap", "is")}
-    columns["trusted"] = [True, False, True]
-    if suffix == "parquet":
-        parquet.write_table(table(columns), tmp_path / "runs.parquet")
-    else:
-        lines = [",".join(columns), *(",".join(str(values[n]) for values in columns.values()) for n in range(3))]
-        (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-    np.testing.assert_allclose(study_offsets(tmp_path, 50, 0), np.tile([0.5, 1.5, 2.5], (50, 1)))
-    with pytest.raises(InputError, match="neither"):
-        study_offsets(tmp_path / "elsewhere", 1, 0)
 
 
 def test_files_tell_the_plan(written: File, folder: File, prepared: Prepared, plan: FemoroplastyPlan) -> None:
@@ -233,8 +211,13 @@ def test_commands_end_to_end(folder: File, capsys: pytest.CaptureFixture[str]) -
     assert {"plan.json", "curves.png", "overlay.png", "fields.vtu", "cement.stl"} <= {p.name for p in out.iterdir()}
     assert main(["plan-offsets", str(out)]) == 0
     offsets = json.loads((out / "offsets.json").read_text())
-    assert set(offsets["outcomes"]) == SIX
+    assert set(offsets["outcomes"]) == SIX | ENDS
     planned = json.loads((out / "plan.json").read_text())["planned"]["yield_load_n"]
+    response = read_response(out / "plan.json")
+    assert response is not None
+    medial = np.array([-response.distance_mm, 0, 0, 0, 0])  # of a left femur; the quadratic goes through what was run
+    quadratic = response.gain_percent + response.slope @ medial + response.curvature @ medial**2 / 2
+    assert quadratic == pytest.approx(offsets["outcomes"]["medial"][0]["gain_percent"])
     assert offsets["planned_n"] == pytest.approx(planned, rel=1e-6)
     study = folder / "study"
     study.mkdir()
@@ -243,7 +226,98 @@ def test_commands_end_to_end(folder: File, capsys: pytest.CaptureFixture[str]) -
     assert main(["plan-robustness", str(out), "--study", str(study), "--draws", "2"]) == 0
     found = json.loads((out / "robustness.json").read_text())  # both err alike: the path is where it was planned
     assert found["gain_percent_median"] == pytest.approx(found["planned_gain_percent"])
+    (folder / "sure.csv").write_text("0,0,0\n0,0,0\n0,0,0\n")
+    shift = ["--covariance", str(folder / "sure.csv"), "--mean", f"[{-response.distance_mm}, 0, 0]", "--draws", "1"]
+    assert main(["plan-robustness", str(out), *shift]) == 0
+    found = json.loads((out / "robustness.json").read_text())
+    assert found["gain_percent_median"] == pytest.approx(offsets["outcomes"]["medial"][0]["gain_percent"])
     capsys.readouterr()
+    for words, told in (
+        ([], "either --study or --covariance"),
+        (["--covariance", str(folder / "no.csv")], "there is no such file"),
+        (["--covariance", str(folder / "sure.csv"), "--mean", "[1, 2]"], "mean: 3 numbers"),
+    ):
+        assert main(["plan-robustness", str(out), *words]) == 2
+        line = capsys.readouterr().err
+        assert told in line
+        assert line.count("\n") == 1
+
+
+def test_a_turned_path_keeps_its_entry_and_is_run_anew(prepared: Prepared, plan: FemoroplastyPlan) -> None:
+    around = Surroundings(prepared.bone)
+    move = turned_ends(plan.path, 3.0)["end superior"]
+    found = {
+        moves: carried_out(prepared, around, plan.path, plan.cement, move, moves)  # type: ignore[arg-type]
+        for moves in ("path", "pattern")
+    }
+    for outcome in found.values():
+        assert outcome.offset_mm == (0.0, 0.0, 0.0)
+        assert np.linalg.norm(outcome.turn_deg) == pytest.approx(np.degrees(3.0 / plan.path.length_mm))
+        assert outcome.yield_load_n != plan.curve.yield_load_n
+    assert found["path"].cement_ml == pytest.approx(ML)
+
+
+def test_the_path_of_a_plan_is_read_by_a_case(written: File, folder: File, plan: FemoroplastyPlan) -> None:
+    text = (folder / "case.yaml").read_text()
+    other = folder / "by_file"
+    other.mkdir()
+    for name in ("ct.nii.gz", "labels.nii.gz", "landmarks.json"):
+        (other / name).symlink_to(folder / name)
+    by_file = text.replace("{entry_point: [86, 5, 100], target: FH}", "{file: ../plan/plan.json}")
+    (other / "case.yaml").write_text(by_file)
+    case = read_case(other)
+    assert case.plan is not None
+    np.testing.assert_allclose(case.plan.entry_point, plan.path.entry, atol=1e-9)
+    assert case.plan.file == other / "../plan/plan.json"
+    (folder / "again").mkdir()
+    write_case(folder / "again", case)
+    again = read_case(folder / "again").plan
+    assert again is not None
+    assert again.file is not None
+    assert again.file.resolve() == (written / "plan.json").resolve()
+    for changed, told in (
+        (by_file.replace("plan.json}", "plan.json, target: FH}"), "stands in the `file` of the plan already"),
+        (by_file.replace("side: left", "side: right"), "is a plan for the left femur"),
+    ):
+        (other / "case.yaml").write_text(changed)
+        write_landmarks(folder / "again" / "landmarks.json", {"FH-l": plan_head(), "FH-r": plan_head()})
+        (other / "landmarks.json").unlink(missing_ok=True)
+        (other / "landmarks.json").symlink_to(folder / "again" / "landmarks.json")
+        with pytest.raises(InputError, match=told):
+            read_case(other)
+
+
+def test_the_report_tells_the_plan(written: File, folder: File, plan: FemoroplastyPlan) -> None:
+    case = read_case(folder)
+    assert case.plan is not None
+    good = ObjectQuality((), 0.0, (0.0, 0.0), (0.1,) * 3, (0.1,) * 3, None, True, "all views agree")
+    pose = torch.eye(4, dtype=torch.float64)
+    covariance = torch.diag(torch.tensor([0.04, 0.04, 0.04, 0.01, 0.01, 0.01], dtype=torch.float64))
+    result = Result(Poses(pose[None], {"femur": pose}), {"femur": good}, path_covariance=covariance)
+    assert planning_section(case, result) == ""  # its path is no plan's
+    file = folder / "with_response.json"
+    content = json.loads((written / "plan.json").read_text())
+    sloped = Response(100 * plan.gain, np.array([5.0, 0, 0, 0, 0]), np.zeros(5), 4.0, plan.path.entry, plan.path.target)
+    write_json(file, content | {"response": response_content(sloped)})
+    page = planning_section(dataclasses.replace(case, plan=dataclasses.replace(case.plan, file=file)), result)
+    assert "the modelled gain is" in page
+    assert "± 1.0 %" in page  # 5 % per mm, 0.2 mm
+    assert f"<td>{plan.curve.yield_load_n:.0f}</td>" in page
+    assert page.count("<tr>") == 2 + 3 + len(plan.path.ellipsoids)
+    assert "research software" in page.lower()
+
+
+def plan_head() -> torch.Tensor:
+    return torch.tensor([20.0, 0.0, 130.0], dtype=torch.float64)
+
+
+def test_the_central_line_runs_along_the_neck_to_the_head(prepared: Prepared) -> None:
+    around = Surroundings(prepared.bone)
+    line = central_path(around, ML, prepared.planning.path)
+    np.testing.assert_allclose(line.target, prepared.bone.femur.frame.head)
+    np.testing.assert_allclose(-line.direction, around.neck, atol=1e-9)
+    assert sum(e.volume_ml for e in line.ellipsoids) == pytest.approx(ML)
+    assert [e.depth_mm / line.length_mm for e in line.ellipsoids] == pytest.approx([0.75, 0.5, 0.25])
 
 
 def test_commands_tell_bad_input_in_one_line(folder: File, capsys: pytest.CaptureFixture[str]) -> None:

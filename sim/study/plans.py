@@ -1,0 +1,146 @@
+"""What plans are worth on three femora, and how far that hangs on the mesh: the measured part of `docs/planning.md`.
+
+Every number is kept in a file of its own as soon as it is there, so that a run that was stopped goes on.
+"""
+
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femoreg_torch.files import read_json, write_json
+from femoreg_torch.planning.convergence import MeshRow, on_mesh
+from femoreg_torch.planning.diffusion import diffuse
+from femoreg_torch.planning.offsets import directions
+from femoreg_torch.planning.path import central_path
+from femoreg_torch.planning.replan import Replan
+from femoreg_torch.planning.report import PLAN_NAME
+from sim.patient.real_femora import write_real_femur
+from sim.theatre.case_folders import write_phantom
+
+VOLUME_ML = 9.5  # as Basafa et al. 2015 injected on average
+OFFSET_MM = 4.0  # of the paper
+MESH_SIZES_MM = (3.0, 2.0, 1.5)
+_SEED = 0  # of the search for the path
+_GENERIC, _MESHES, _COST, _OUTCOMES = "generic", "meshes.json", "cost.json", "outcomes.json"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A femur to plan for."""
+
+    name: str
+    title: str
+    make: Callable[[Path, Path], None]  # writes its case into a folder, from the folder of the real bone shapes
+
+
+def _procedural(folder: Path, data: Path) -> None:
+    write_phantom(folder, 315, "left", 1.0)
+
+
+def _real(name: str) -> Callable[[Path, Path], None]:
+    return lambda folder, data: write_real_femur(name, data, folder)
+
+
+SUBJECTS = (
+    Subject("procedural", "procedural, osteoporotic (seed 315)", _procedural),
+    Subject("sts_044", "real CT (STS_044), right", _real("sts_044")),
+    Subject("sts_020", "real CT (STS_020), left", _real("sts_020")),
+)
+
+
+def measure(subject: Subject, out: Path, data: Path) -> None:
+    """Make the case of a subject, plan it, and move the plan, as far as it is not done yet."""
+    folder = out / subject.name
+    case, plan = folder / "case", folder / "plan"
+    if not case.is_dir():
+        folder.mkdir(parents=True, exist_ok=True)
+        subject.make(case, data)
+    if not (plan / PLAN_NAME).is_file():
+        write_json(folder / _COST, _timed_plan(case, plan))
+    _outcomes(folder)
+
+
+def _timed_plan(case: Path, plan: Path) -> dict[str, Any]:
+    """Run `femoreg plan` as a user does, and what it cost."""
+    words = ["plan", str(case), "--out", str(plan), "--volume-ml", str(VOLUME_ML), "--seed", str(_SEED)]
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run([sys.executable, "-m", "femoreg_torch.commands.main", *words], check=True)
+    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"wall_s": wall, "processor_s": used, "peak_gb": after.ru_maxrss / 2**20, "cores": os.cpu_count()}
+
+
+def _outcomes(folder: Path) -> None:
+    """Loads of the central line and of the plan in six directions, each written as soon as it is there."""
+    file = folder / _OUTCOMES
+    found: dict[str, Any] = read_json(file) if file.is_file() else {}
+    wanted = [_GENERIC, *directions("left")]
+    if set(wanted) <= set(found):
+        return
+    again = Replan(folder / "plan")
+    found |= {"baseline_n": again.baseline_n, "planned_n": again.planned_n}
+    for name in wanted:
+        if name in found:
+            continue
+        if name == _GENERIC:
+            line = central_path(again.around, VOLUME_ML, again.stored.planning.path)
+            found[name] = asdict(again.along(line))
+        else:
+            found[name] = asdict(again.at(OFFSET_MM * directions(again.side)[name]))
+        write_json(file, found)
+
+
+def compare_meshes(subject: Subject, out: Path, sizes_mm: Sequence[float] = MESH_SIZES_MM) -> None:
+    """Yield load, and gain of the planned cement, of a subject that has a plan, on each mesh that is not done yet."""
+    folder = out / subject.name
+    file = folder / _MESHES
+    rows: dict[str, Any] = read_json(file) if file.is_file() else {}
+    missing = [size for size in sizes_mm if f"{size:g}" not in rows]
+    if not missing:
+        return
+    again = Replan(folder / "plan")
+    path, prepared = again.stored.path, again.prepared
+    cement = diffuse(prepared.bone, path.injections(), prepared.planning.diffusion)
+    for size in missing:
+        rows[f"{size:g}"] = asdict(on_mesh(prepared, cement, size))
+        write_json(file, rows)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What there is of a subject."""
+
+    subject: Subject
+    cost: dict[str, Any]
+    plan: dict[str, Any]
+    outcomes: dict[str, Any]
+    meshes: list[MeshRow]
+
+
+def measured(subject: Subject, out: Path) -> Measured | None:
+    """What was measured of a subject so far; None if it has no plan yet."""
+    folder = out / subject.name
+    if not (folder / "plan" / PLAN_NAME).is_file():
+        return None
+    kept = [read_json(path) if (path := folder / name).is_file() else {} for name in (_COST, _OUTCOMES, _MESHES)]
+    rows = sorted((MeshRow(**row) for row in kept[2].values()), key=lambda row: -row.size_mm)
+    return Measured(subject, kept[0], read_json(folder / "plan" / PLAN_NAME), kept[1], rows)
+
+
+def gain_percent(found: Measured, name: str) -> float:
+    """Gain over the bare femur of `generic` or a direction, %; nan if it was not run."""
+    outcome = found.outcomes.get(name)
+    return float("nan") if outcome is None else 100 * (outcome["yield_load_n"] / found.outcomes["baseline_n"] - 1)
+
+
+def six_directions(found: Measured) -> np.ndarray:
+    """Gains (6,) of the moved plan, %."""
+    return np.array([gain_percent(found, name) for name in directions("left")])
