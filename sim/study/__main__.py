@@ -247,6 +247,7 @@ def plans(
     for number, subject in enumerate(planning.SUBJECTS[:first]):
         print(subject.title, flush=True)
         planning.measure(subject, out, data)
+        planning.compare_laws(subject, out)
         if meshes and number == 0:
             planning.compare_meshes(subject, out)
     if docs is not None:

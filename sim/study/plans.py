@@ -9,19 +9,23 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from femoreg_torch.case import read_case
 from femoreg_torch.files import read_json, write_json
 from femoreg_torch.planning.convergence import MeshRow, on_mesh
 from femoreg_torch.planning.diffusion import diffuse
-from femoreg_torch.planning.offsets import directions
+from femoreg_torch.planning.offsets import Outcome, directions, turned_ends
 from femoreg_torch.planning.path import central_path
+from femoreg_torch.planning.prepare import prepare
 from femoreg_torch.planning.replan import Replan
-from femoreg_torch.planning.report import PLAN_NAME
+from femoreg_torch.planning.report import PLAN_NAME, add_response
+from femoreg_torch.planning.response import read_response
+from femoreg_torch.planning.settings import load_planning
 from sim.patient.real_femora import write_real_femur
 from sim.theatre.case_folders import write_phantom
 
@@ -29,7 +33,13 @@ VOLUME_ML = 9.5  # as Basafa et al. 2015 injected on average
 OFFSET_MM = 4.0  # of the paper
 MESH_SIZES_MM = (3.0, 2.0, 1.5)
 _SEED = 0  # of the search for the path
-_GENERIC, _MESHES, _COST, _OUTCOMES = "generic", "meshes.json", "cost.json", "outcomes.json"
+LAWS: tuple[tuple[Literal["fall", "stance"], Literal["keyak", "morgan"]], ...] = (
+    ("fall", "keyak"),
+    ("fall", "morgan"),
+    ("stance", "keyak"),
+    ("stance", "morgan"),
+)
+_GENERIC, _MESHES, _COST, _OUTCOMES, _LAWS = "generic", "meshes.json", "cost.json", "outcomes.json", "laws.json"
 
 
 @dataclass(frozen=True)
@@ -79,23 +89,27 @@ def _timed_plan(case: Path, plan: Path) -> dict[str, Any]:
 
 
 def _outcomes(folder: Path) -> None:
-    """Loads of the central line and of the plan in six directions, each written as soon as it is there."""
-    file = folder / _OUTCOMES
+    """Loads of the central line, of the plan moved in six directions, and with its end moved; each is written at once.
+
+    At last the plan learns how its gain answers to small errors, as by `femoreg plan-offsets`.
+    """
+    plan, file = folder / "plan", folder / _OUTCOMES
     found: dict[str, Any] = read_json(file) if file.is_file() else {}
-    wanted = [_GENERIC, *directions("left")]
-    if set(wanted) <= set(found):
+    if read_response(plan / PLAN_NAME) is not None:
         return
-    again = Replan(folder / "plan")
+    again = Replan(plan)
     found |= {"baseline_n": again.baseline_n, "planned_n": again.planned_n}
-    for name in wanted:
-        if name in found:
-            continue
-        if name == _GENERIC:
-            line = central_path(again.around, VOLUME_ML, again.stored.planning.path)
-            found[name] = asdict(again.along(line))
-        else:
-            found[name] = asdict(again.at(OFFSET_MM * directions(again.side)[name]))
+    moves = {name: OFFSET_MM * way for name, way in directions(again.side).items()}
+    moves |= turned_ends(again.stored.path, OFFSET_MM)
+    if _GENERIC not in found:
+        line = central_path(again.around, VOLUME_ML, again.stored.planning.path)
+        found[_GENERIC] = asdict(again.along(line))
         write_json(file, found)
+    for name in moves:
+        if name not in found:
+            found[name] = asdict(again.at(moves[name]))
+            write_json(file, found)
+    add_response(plan, again.response({name: Outcome(**found[name]) for name in moves}, OFFSET_MM))
 
 
 def compare_meshes(subject: Subject, out: Path, sizes_mm: Sequence[float] = MESH_SIZES_MM) -> None:
@@ -114,6 +128,20 @@ def compare_meshes(subject: Subject, out: Path, sizes_mm: Sequence[float] = MESH
         write_json(file, rows)
 
 
+def compare_laws(subject: Subject, out: Path) -> None:
+    """Yield loads without cement of a subject in a fall and in stance, by both laws of bone, that are not done yet."""
+    folder = out / subject.name
+    file = folder / _LAWS
+    found: dict[str, Any] = read_json(file) if file.is_file() else {}
+    case, planning = read_case(folder / "case"), load_planning()
+    for kind, law in LAWS:
+        if f"{kind} {law}" not in found:
+            bone, load = replace(planning.bone, law=law), replace(planning.load, kind=kind)
+            curve = prepare(case, replace(planning, bone=bone, load=load)).curve()
+            found[f"{kind} {law}"] = {"yield_load_n": curve.yield_load_n, "stiffness_n_mm": curve.stiffness_n_mm}
+            write_json(file, found)
+
+
 @dataclass(frozen=True)
 class Measured:
     """What there is of a subject."""
@@ -123,6 +151,7 @@ class Measured:
     plan: dict[str, Any]
     outcomes: dict[str, Any]
     meshes: list[MeshRow]
+    laws: dict[str, Any]
 
 
 def measured(subject: Subject, out: Path) -> Measured | None:
@@ -130,9 +159,9 @@ def measured(subject: Subject, out: Path) -> Measured | None:
     folder = out / subject.name
     if not (folder / "plan" / PLAN_NAME).is_file():
         return None
-    kept = [read_json(path) if (path := folder / name).is_file() else {} for name in (_COST, _OUTCOMES, _MESHES)]
+    kept = [read_json(path) if (path := folder / name).is_file() else {} for name in (_COST, _OUTCOMES, _MESHES, _LAWS)]
     rows = sorted((MeshRow(**row) for row in kept[2].values()), key=lambda row: -row.size_mm)
-    return Measured(subject, kept[0], read_json(folder / "plan" / PLAN_NAME), kept[1], rows)
+    return Measured(subject, kept[0], read_json(folder / "plan" / PLAN_NAME), kept[1], rows, kept[3])
 
 
 def gain_percent(found: Measured, name: str) -> float:

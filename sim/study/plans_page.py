@@ -7,7 +7,7 @@ from femoreg_torch.planning.figures import mesh_figure
 from femoreg_torch.planning.offsets import directions
 from sim.study.figures import save
 from sim.study.page import number, table, write_section
-from sim.study.plans import MESH_SIZES_MM, OFFSET_MM, VOLUME_ML, Measured, gain_percent, six_directions
+from sim.study.plans import LAWS, MESH_SIZES_MM, OFFSET_MM, VOLUME_ML, Measured, gain_percent, six_directions
 
 PAGE, TITLE = "planning.md", "What was measured"
 _LOAD_PERCENT, _GAIN_POINTS = 5.0, 3.0  # wanted of a mesh against the finest
@@ -18,6 +18,7 @@ one's. The two others are real CTs of patients with a tumour of soft tissue near
 real grey values of 1 × 1 × 3.3 mm and bone that nobody called osteoporotic; they were scanned without a phantom, came
 without labels, and were cut out by threshold, the head by a sphere placed by eye. All are calibrated by air, fat and
 muscle with densities that are not confirmed."""
+_LAWS_TOLD = """TOLD"""
 _COMPARABLE = """The paper's row is one osteoporotic specimen under a model whose mesh, materials and supports were
 not published. **Compare** the order of the gain, and what 4 mm cost in points. **Do not compare** loads in N with it:
 these are other bones, and supports alone move a load by a factor of two. Between the other rows settings are equal, so
@@ -38,6 +39,7 @@ def plans_text(all_found: Sequence[Measured], command: str, figure: str) -> str:
             ("femur", *directions("left")),
             [[f.subject.title, *(_points(gain_percent(f, name)) for name in directions("left"))] for f in all_found],
         ),
+        _laws(all_found),
         _costs(all_found),
         _meshes(all_found, figure),
     ]
@@ -76,6 +78,22 @@ def _load(bare: float, load: float) -> str:
 
 def _points(gain: float) -> str:
     return "–" if gain != gain else f"{gain:+.0f} %"
+
+
+def _laws(all_found: Sequence[Measured]) -> str:
+    names = [f"{kind} {law}" for kind, law in LAWS]
+    rows = [
+        [
+            found.subject.title,
+            *(f"{found.laws[name]['yield_load_n']:.0f}" if name in found.laws else "–" for name in names),
+        ]
+        for found in all_found
+        if found.laws
+    ]
+    if not rows:
+        return ""
+    header = ("bare, N", *(f"{kind}, {law.capitalize()}" for kind, law in LAWS))
+    return f"Other loads and the other law of bone, without cement:\n\n{table(header, rows)}\n\n{_LAWS_TOLD}"
 
 
 def _costs(all_found: Sequence[Measured]) -> str:

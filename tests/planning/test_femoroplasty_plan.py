@@ -26,7 +26,7 @@ from femoreg_torch.planning.prepare import Prepared, prepare
 from femoreg_torch.planning.report import read_plan, write_plan
 from femoreg_torch.planning.response import Response, read_response, response_content
 from femoreg_torch.planning.settings import Planning, load_planning
-from femoreg_torch.volume import Volume, read_label_map, write_landmarks, write_volume
+from femoreg_torch.volume import Volume, read_ct, read_label_map, write_landmarks, write_volume
 
 PRESET = """extends: default
 calibration: {kind: uncalibrated}
@@ -331,6 +331,54 @@ def test_commands_tell_bad_input_in_one_line(folder: File, capsys: pytest.Captur
     write_json(folder / "wrong" / "plan.json", {"version": 1})
     assert main(["plan-offsets", str(folder / "wrong")]) == 2
     assert "is no plan of `femoreg plan`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("cut", "the left femur is cut off by the CT at the top"),
+        ("pieces", "the left femur has 2 pieces"),
+        ("hollow", "the left femur has holes of"),
+        ("no air", "calibration: the CT has no peak of air"),
+    ],
+)
+def test_a_case_that_cannot_be_planned_is_told_in_one_line(
+    folder: File, tmp_path: File, capsys: pytest.CaptureFixture[str], change: str, told: str
+) -> None:
+    ct, labels = read_ct(folder / "ct.nii.gz"), read_label_map(folder / "labels.nii.gz")
+    hu, data = ct.data.clone(), labels.data.clone()
+    if change == "cut":
+        hu, data = hu[:66], data[:66]
+    elif change == "pieces":
+        data[2:20, 2:8, 2:8] = 5
+    elif change == "hollow":
+        data[40:60, 17:23, 39:45] = 0
+    else:
+        hu = hu.clamp(min=-95)  # a CT cropped to the patient
+    for file in ("case.yaml", "landmarks.json"):
+        (tmp_path / file).symlink_to(folder / file)
+    write_volume(tmp_path / "ct.nii.gz", Volume(hu, ct.lps_from_index))
+    write_volume(tmp_path / "labels.nii.gz", Volume(data, labels.lps_from_index))
+    preset = [] if change == "no air" else ["--preset", str(folder / "preset.yaml")]
+    assert main(["plan", str(tmp_path), "--out", str(tmp_path / "out"), *preset]) == 2
+    line = capsys.readouterr().err
+    assert told in line
+    assert line.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_path_that_leaves_the_bone_is_told_in_one_line(
+    written: File, tmp_path: File, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = json.loads((written / "plan.json").read_text())
+    for point in content["plan"].values():
+        point[1] += 60.0
+    (tmp_path / "cement.nii.gz").symlink_to(written / "cement.nii.gz")
+    write_json(tmp_path / "plan.json", content)
+    assert main(["plan-offsets", str(tmp_path)]) == 2
+    line = capsys.readouterr().err
+    assert "the path leaves the bone" in line
+    assert line.count("\n") == 1
 
 
 def test_a_case_without_a_head_is_refused(folder: File, settings: Planning) -> None:

@@ -1,10 +1,18 @@
 """How uncertain one object is beside another, against motions that are drawn and carried out."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import torch
+from registration_scenes import REFERENCE_POINTS, make_scene, true_poses
 from scipy.spatial.transform import Rotation
 
+from femoreg_torch.case import Case
+from femoreg_torch.case.model import PlannedPath
+from femoreg_torch.geometry import transform_points
 from femoreg_torch.registration.covariance import IntrinsicsEstimate, PoseCovariance
+from femoreg_torch.registration.quality import Limits, final_covariance, path_covariance
 
 
 def test_one_object_beside_another_at_a_point() -> None:
@@ -46,3 +54,23 @@ def test_what_a_point_on_both_sees_is_told_as_relative_mm() -> None:
     covariance = PoseCovariance(("femur", "device"), matrix, matrix, centres, none, torch.zeros(12))
     at_device = covariance.beside("device", "femur", centres[1], images_only=False)
     np.testing.assert_allclose(at_device.diagonal()[:3].sqrt(), covariance.relative_mm("device", "femur"))
+
+
+def test_a_path_is_uncertain_by_what_the_images_leave_open() -> None:
+    """At the truth of drawn views: tenths of a mm, and along the axes of the femur, whatever camera 1 calls them."""
+    truth = true_poses()
+    scene = make_scene(truth)
+    covariance = final_covariance(scene, truth)
+    plan = PlannedPath("femur", REFERENCE_POINTS["femur"], REFERENCE_POINTS["femur"] + 10, "device")
+    case = Case(Path(), scene.carm, {}, plan=plan)
+    found = path_covariance(case, scene, truth, covariance, Limits())
+    assert found is not None
+    deviations = found.diagonal().sqrt()
+    assert 0.001 < deviations[:3].max() < 0.5
+    assert 0.001 < deviations[3:].max() < 0.6
+    turn = truth.camera1_from["femur"][:3, :3]
+    entry = transform_points(truth.camera1_from["femur"], plan.entry_point[None])[0]
+    seen = covariance.beside("device", "femur", entry, images_only=True)
+    torch.testing.assert_close(turn @ found[:3, :3] @ turn.T, seen[:3, :3])
+    torch.testing.assert_close(turn @ found[3:, 3:] @ turn.T, seen[3:, 3:])
+    assert path_covariance(replace(case, plan=None), scene, truth, covariance, Limits()) is None

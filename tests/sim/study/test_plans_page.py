@@ -15,7 +15,7 @@ def found(outcomes: dict[str, Any], meshes: list[MeshRow]) -> Measured:
     loads = {"baseline": 2000.0, "planned": 2800.0, "optimum": 3300.0}
     plan: dict[str, Any] = {name: {"yield_load_n": load} for name, load in loads.items()} | {"elements": 6400}
     cost = {"processor_s": 120.4, "wall_s": 130.0, "peak_gb": 1.23, "cores": 2}
-    return Measured(SUBJECTS[0], cost, plan, outcomes, meshes)
+    return Measured(SUBJECTS[0], cost, plan, outcomes, meshes, {"fall keyak": {"yield_load_n": 2000.0}})
 
 
 def test_the_table_holds_loads_gains_and_what_was_not_run() -> None:
@@ -33,6 +33,7 @@ def test_the_table_holds_loads_gains_and_what_was_not_run() -> None:
     assert "| 2000 | 2400 (+20 %) | 2800 (+40 %) | 3300 (+65 %) | +30 % to +42 % |" in text
     assert "| " + " | ".join(f"+{gains[name]} %" for name in directions("left")) + " |" in text
     assert "| 6400 | 120 | 130 | 1.2 |" in text
+    assert "| 2000 | – | – | – |" in text
     assert "mesh.png" not in text
     bare = plans_text([found({}, [])], "make plans", "mesh.png")
     assert "| 2000 | – | 2800 (+40 %) | 3300 (+65 %) | – |" in bare
