@@ -142,8 +142,8 @@ def plan_robustness(
         moves = study_moves(study, count, seed)  # first: the femur takes a while
     else:
         assert covariance is not None  # one of the two
-        spread = read_covariance(covariance)
-        moves = normal_moves(np.zeros(len(spread)) if mean is None else np.array(mean), spread, count, seed)
+        variance = read_covariance(covariance)
+        moves = normal_moves(np.zeros(len(variance)) if mean is None else np.array(mean), variance, count, seed)
     again = Replan(plan, case)
     with progress_report(console, "draws") as report:
         outcomes = []

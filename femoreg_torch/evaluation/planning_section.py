@@ -1,6 +1,7 @@
 """The section of a registration's report on the cement plan that its path is from."""
 
 import base64
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def _percent(gain: float | None) -> str:
     return "" if gain is None else f"{100 * gain:+.0f} %"
 
 
-def _table(columns: tuple[str, ...], rows: list[tuple[str, ...]] | list[list[str]]) -> str:
+def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{escape(column)}</th>" for column in columns)
     lines = ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
     return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"

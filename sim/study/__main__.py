@@ -25,6 +25,7 @@ from sim.study.trust import sabotaged_runs, write_trust
 
 _DATA = Path(os.environ.get("FEMOREG_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 _OUT = Path("out/accuracy")
+_PAPER_RUNS = Path(__file__).resolve().parents[2] / "docs" / "results" / "paper"
 Kind = Literal["all", "procedural", "real"]
 
 
@@ -248,6 +249,8 @@ def plans(
         print(subject.title, flush=True)
         planning.measure(subject, out, data)
         planning.compare_laws(subject, out)
+        if number == 0:
+            planning.draw_errors(subject, out, _PAPER_RUNS)
         if meshes and number == 0:
             planning.compare_meshes(subject, out)
     if docs is not None:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from femoreg_torch.case import read_case
+from femoreg_torch.commands.plan import plan_robustness
 from femoreg_torch.files import read_json, write_json
 from femoreg_torch.planning.convergence import MeshRow, on_mesh
 from femoreg_torch.planning.diffusion import diffuse
@@ -24,13 +25,14 @@ from femoreg_torch.planning.path import central_path
 from femoreg_torch.planning.prepare import prepare
 from femoreg_torch.planning.replan import Replan
 from femoreg_torch.planning.report import PLAN_NAME, add_response
-from femoreg_torch.planning.response import read_response
+from femoreg_torch.planning.response import Response, read_response
 from femoreg_torch.planning.settings import load_planning
 from sim.patient.real_femora import write_real_femur
 from sim.theatre.case_folders import write_phantom
 
 VOLUME_ML = 9.5  # as Basafa et al. 2015 injected on average
 OFFSET_MM = 4.0  # of the paper
+DRAWS = 20  # of a study's errors
 MESH_SIZES_MM = (3.0, 2.0, 1.5)
 _SEED = 0  # of the search for the path
 LAWS: tuple[tuple[Literal["fall", "stance"], Literal["keyak", "morgan"]], ...] = (
@@ -40,6 +42,7 @@ LAWS: tuple[tuple[Literal["fall", "stance"], Literal["keyak", "morgan"]], ...] =
     ("stance", "morgan"),
 )
 _GENERIC, _MESHES, _COST, _OUTCOMES, _LAWS = "generic", "meshes.json", "cost.json", "outcomes.json", "laws.json"
+_ROBUSTNESS = "robustness.json"
 
 
 @dataclass(frozen=True)
@@ -128,6 +131,13 @@ def compare_meshes(subject: Subject, out: Path, sizes_mm: Sequence[float] = MESH
         write_json(file, rows)
 
 
+def draw_errors(subject: Subject, out: Path, study: Path) -> None:
+    """Carry the plan of a subject out under the errors of a study's registrations, unless it is done."""
+    plan = out / subject.name / "plan"
+    if not (plan / _ROBUSTNESS).is_file():
+        plan_robustness(plan, study=study, draws=DRAWS)
+
+
 def compare_laws(subject: Subject, out: Path) -> None:
     """Yield loads without cement of a subject in a fall and in stance, by both laws of bone, that are not done yet."""
     folder = out / subject.name
@@ -152,6 +162,8 @@ class Measured:
     outcomes: dict[str, Any]
     meshes: list[MeshRow]
     laws: dict[str, Any]
+    draws: dict[str, Any]  # what `femoreg plan-robustness` wrote
+    response: Response | None
 
 
 def measured(subject: Subject, out: Path) -> Measured | None:
@@ -161,7 +173,9 @@ def measured(subject: Subject, out: Path) -> Measured | None:
         return None
     kept = [read_json(path) if (path := folder / name).is_file() else {} for name in (_COST, _OUTCOMES, _MESHES, _LAWS)]
     rows = sorted((MeshRow(**row) for row in kept[2].values()), key=lambda row: -row.size_mm)
-    return Measured(subject, kept[0], read_json(folder / "plan" / PLAN_NAME), kept[1], rows, kept[3])
+    plan, draws = folder / "plan" / PLAN_NAME, folder / "plan" / _ROBUSTNESS
+    drawn = read_json(draws) if draws.is_file() else {}
+    return Measured(subject, kept[0], read_json(plan), kept[1], rows, kept[3], drawn, read_response(plan))
 
 
 def gain_percent(found: Measured, name: str) -> float:

@@ -3,19 +3,31 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from femoreg_torch.planning.convergence import MeshRow
 from femoreg_torch.planning.offsets import directions
+from femoreg_torch.planning.response import Response
 from sim.study.plans import SUBJECTS, Measured
 from sim.study.plans_page import plans_text, write_plans
+
+DRAWN: dict[str, Any] = {
+    "gain_percent_median": 39.6,
+    "gain_percent_p5": 38.0,
+    "gain_percent_p95": 41.0,
+    "planned_gain_percent": 40.0,
+    "outcomes": {"draws": [{}] * 20},
+}
+# 3 % per mm along one axis: with 2.64 mm in the mean, 1.654 mm along each axis, 5 % in the end
+FLAT = Response(40.0, np.array([3.0, 0, 0, 0, 0]), np.zeros(5), 4.0, np.zeros(3), np.array([-60.0, 0, 30]))
 
 
 def found(outcomes: dict[str, Any], meshes: list[MeshRow]) -> Measured:
     loads = {"baseline": 2000.0, "planned": 2800.0, "optimum": 3300.0}
     plan: dict[str, Any] = {name: {"yield_load_n": load} for name, load in loads.items()} | {"elements": 6400}
     cost = {"processor_s": 120.4, "wall_s": 130.0, "peak_gb": 1.23, "cores": 2}
-    return Measured(SUBJECTS[0], cost, plan, outcomes, meshes, {"fall keyak": {"yield_load_n": 2000.0}})
+    return Measured(SUBJECTS[0], cost, plan, outcomes, meshes, {"fall keyak": {"yield_load_n": 2000.0}}, DRAWN, FLAT)
 
 
 def test_the_table_holds_loads_gains_and_what_was_not_run() -> None:
@@ -34,6 +46,9 @@ def test_the_table_holds_loads_gains_and_what_was_not_run() -> None:
     assert "| " + " | ".join(f"+{gains[name]} %" for name in directions("left")) + " |" in text
     assert "| 6400 | 120 | 130 | 1.2 |" in text
     assert "| 2000 | – | – | – |" in text
+    assert "20 draws" in text
+    assert "gain 39.6 % (5 to 95 %: 38.0 to 41.0 %), as planned 40.0 %" in text
+    assert "40 ± 5 %." in text
     assert "mesh.png" not in text
     bare = plans_text([found({}, [])], "make plans", "mesh.png")
     assert "| 2000 | – | 2800 (+40 %) | 3300 (+65 %) | – |" in bare
