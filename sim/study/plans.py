@@ -17,7 +17,7 @@ import numpy as np
 
 from femoreg_torch.case import read_case
 from femoreg_torch.commands.plan import plan_robustness
-from femoreg_torch.files import read_json, write_json
+from femoreg_torch.files import read_json, write_json, write_text
 from femoreg_torch.planning.convergence import MeshRow, on_mesh
 from femoreg_torch.planning.diffusion import diffuse
 from femoreg_torch.planning.offsets import Outcome, directions, turned_ends
@@ -42,7 +42,7 @@ LAWS: tuple[tuple[Literal["fall", "stance"], Literal["keyak", "morgan"]], ...] =
     ("stance", "morgan"),
 )
 _GENERIC, _MESHES, _COST, _OUTCOMES, _LAWS = "generic", "meshes.json", "cost.json", "outcomes.json", "laws.json"
-_ROBUSTNESS = "robustness.json"
+_ROBUSTNESS, _PRESET = "robustness.json", "preset.yaml"
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class Subject:
 
     name: str
     title: str
-    make: Callable[[Path, Path], None]  # writes its case into a folder, from the folder of the real bone shapes
+    make: Callable[[Path, Path], None]  # writes its case into a folder, from the folder of the real CTs
+    calibration: Literal["internal", "uncalibrated"] = "internal"
 
 
 def _procedural(folder: Path, data: Path) -> None:
@@ -65,7 +66,8 @@ def _real(name: str) -> Callable[[Path, Path], None]:
 SUBJECTS = (
     Subject("procedural", "procedural, osteoporotic (seed 315)", _procedural),
     Subject("sts_044", "real CT (STS_044), right", _real("sts_044")),
-    Subject("sts_020", "real CT (STS_020), left", _real("sts_020")),
+    # its tumour hides the peak of muscle, which `femoreg plan` says in one line
+    Subject("sts_020", "real CT (STS_020), left, uncalibrated", _real("sts_020"), "uncalibrated"),
 )
 
 
@@ -76,14 +78,16 @@ def measure(subject: Subject, out: Path, data: Path) -> None:
     if not case.is_dir():
         folder.mkdir(parents=True, exist_ok=True)
         subject.make(case, data)
+    write_text(folder / _PRESET, f"extends: default\ncalibration: {{kind: {subject.calibration}}}\n")
     if not (plan / PLAN_NAME).is_file():
-        write_json(folder / _COST, _timed_plan(case, plan))
+        write_json(folder / _COST, _timed_plan(case, plan, folder / _PRESET))
     _outcomes(folder)
 
 
-def _timed_plan(case: Path, plan: Path) -> dict[str, Any]:
+def _timed_plan(case: Path, plan: Path, preset: Path) -> dict[str, Any]:
     """Run `femoreg plan` as a user does, and what it cost."""
     words = ["plan", str(case), "--out", str(plan), "--volume-ml", str(VOLUME_ML), "--seed", str(_SEED)]
+    words += ["--preset", str(preset)]
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run([sys.executable, "-m", "femoreg_torch.commands.main", *words], check=True)
     wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -143,7 +147,7 @@ def compare_laws(subject: Subject, out: Path) -> None:
     folder = out / subject.name
     file = folder / _LAWS
     found: dict[str, Any] = read_json(file) if file.is_file() else {}
-    case, planning = read_case(folder / "case"), load_planning()
+    case, planning = read_case(folder / "case"), load_planning(folder / _PRESET)
     for kind, law in LAWS:
         if f"{kind} {law}" not in found:
             bone, load = replace(planning.bone, law=law), replace(planning.load, kind=kind)
