@@ -59,12 +59,12 @@ def make_plan(
     around = Surroundings(bone)
     mechanisms = list(optimum.mechanisms)
     tried: list[tuple[Array, Path, Array, Curve]] = []
-    for n in range(1 + planning.path.polish):
-        begun, share = 0.5 + 0.5 * n / (1 + planning.path.polish), 0.5 / (1 + planning.path.polish)
+    searches = 1 + planning.path.polish
+    for n in range(searches):
         worth = places(bone, model, mechanisms, planning.cement)
         planner = Planner(around, worth, volume_ml, planning.path)
         start = max(tried, key=_load)[0] if tried else None
-        x = planner.search(rng, lambda part, begun=begun, share=share: progress("path", begun + share * part), start)
+        x = planner.search(rng, _within(progress, n / searches, 1 / searches), start)
         path = planner.path(x)
         cement = diffuse(bone, path.injections(), planning.diffusion)
         material = with_cement(model, bone, cement, planning.cement)
@@ -74,6 +74,11 @@ def make_plan(
     clearances = around.clearances(path, planning.path)
     loads = tuple(_load(each) for each in tried)
     return FemoroplastyPlan(volume_ml, optimum, path, clearances, cement, curve, loads)
+
+
+def _within(progress: Progress, begun: float, share: float) -> Callable[[float], None]:
+    """Progress of one search, as a part of the second half of all."""
+    return lambda part: progress("path", 0.5 + 0.5 * (begun + share * part))
 
 
 def _load(tried: tuple[Array, Path, Array, Curve]) -> float:
