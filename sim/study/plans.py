@@ -33,7 +33,7 @@ from sim.theatre.case_folders import write_phantom
 VOLUME_ML = 9.5  # as Basafa et al. 2015 injected on average
 OFFSET_MM = 4.0  # of the paper
 DRAWS = 20  # of a study's errors
-MESH_SIZES_MM = (3.0, 2.0, 1.5)
+MESH_SIZES_MM = (3.0, 2.5, 2.0, 1.5)
 _SEED = 0  # of the search for the path
 LAWS: tuple[tuple[Literal["fall", "stance"], Literal["keyak", "morgan"]], ...] = (
     ("fall", "keyak"),

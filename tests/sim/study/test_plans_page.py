@@ -48,7 +48,7 @@ def test_the_table_holds_loads_gains_and_what_was_not_run() -> None:
     assert "| 2000 | – | – | – |" in text
     assert "20 draws" in text
     assert "gain 39.6 % (5 to 95 %: 38.0 to 41.0 %), as planned 40.0 %" in text
-    assert "40 ± 5 %." in text
+    assert "(seed 315) 40 ± 5 %." in text
     assert "mesh.png" not in text
     bare = plans_text([found({}, [])], "make plans", "mesh.png")
     assert "| 2000 | – | 2800 (+40 %) | 3300 (+65 %) | – |" in bare
@@ -62,7 +62,9 @@ def test_meshes_are_held_against_the_finest(tmp_path: Path, load: float, gain: f
     (tmp_path / "planning.md").write_text("# Plan\n\nHead.\n\n## What was measured\n\nOld.\n\n## Last\n\nKept.\n")
     write_plans([found({}, rows)], "make plans", tmp_path)
     page = (tmp_path / "planning.md").read_text()
-    assert f"of the finest (2 mm): {kept}. Not run: 1.5 mm." in page
+    assert f"of the finest (2 mm): {kept}." in page
+    assert ("**3 mm is not**" in page) == (kept == "2 mm")
+    assert "Not run: 2.5 mm, 1.5 mm." in page
     assert "Old." not in page
     assert page.startswith("# Plan\n\nHead.")
     assert page.endswith("## Last\n\nKept.\n")
