@@ -70,6 +70,7 @@ def offsets_figure(outcomes: Mapping[str, Outcome], baseline_n: float, planned_n
     axis = figure.subplots()
     gains = [100 * (outcome.yield_load_n / baseline_n - 1) for outcome in outcomes.values()]
     axis.bar(list(outcomes), gains, color="#3b6ea5")
+    axis.tick_params(axis="x", rotation=30)
     axis.axhline(100 * (planned_n / baseline_n - 1), color="#c0602b", label="as planned")
     axis.set(ylabel="gain of yield load, %", title="Plan carried out beside its place, modelled")
     axis.legend(loc="lower right")
