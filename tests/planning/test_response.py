@@ -69,7 +69,7 @@ def test_the_quadratic_is_found_again(response: Response) -> None:
 def test_mean_and_deviation_are_those_of_many_moved_paths(response: Response) -> None:
     root = np.random.default_rng(1).normal(size=(6, 6))
     covariance = np.diag([1, 1, 1, 0.5, 0.5, 0.5]) @ (root @ root.T / 6) @ np.diag([1, 1, 1, 0.5, 0.5, 0.5])
-    drawn = np.array([gain_of(move) for move in normal_moves(np.zeros(6), covariance, 4000, 0)])
+    drawn = np.array([gain_of(move) for move in normal_moves(np.zeros(6), covariance, 2000, 0)])
     quoted = response.under(covariance)
     assert quoted.gain_percent == pytest.approx(drawn.mean(), abs=4 * drawn.std() / np.sqrt(len(drawn)))
     assert quoted.deviation_percent == pytest.approx(drawn.std(), rel=0.06)
