@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test lint notebooks bench bench-gpu accuracy capture-range trust ablation
+.PHONY: setup demo test lint notebooks bench bench-gpu accuracy capture-range trust ablation plans
 
 setup: .venv/.installed
 
@@ -51,6 +51,10 @@ capture-range: setup
 
 trust: setup
 	$(BIN)/python -m sim.study trust --preset $(PRESET) --docs docs
+
+# Plans for three femora, their offsets, and meshes; renews docs/planning.md. Goes on where it was stopped.
+plans: setup
+	$(BIN)/python -m sim.study plans --docs docs
 
 ablation: setup
 	$(BIN)/python -m sim.study ablation --jobs $(JOBS) --docs docs

@@ -1,6 +1,7 @@
 """The femoroplasty of the paper as a template of a case: pelvis, operated femur, and a device with a guide."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from torch import Tensor
 
@@ -67,6 +68,8 @@ def with_device(case: Case, device: Device) -> Case:
     return replace(case, objects={**case.objects, DEVICE: _device_object(device)}, plan=plan)
 
 
-def planned(side: Side, entry_point: Tensor, target: Tensor, device: Device | None) -> PlannedPath:
-    """The drill path (3,), (3,) through the operated femur."""
-    return PlannedPath(FEMUR, entry_point, target, None if device is None else DEVICE)
+def planned(
+    side: Side, entry_point: Tensor, target: Tensor, device: Device | None, file: Path | None = None
+) -> PlannedPath:
+    """The drill path (3,), (3,) through the operated femur; `file` is the plan.json that it is from."""
+    return PlannedPath(FEMUR, entry_point, target, None if device is None else DEVICE, file)

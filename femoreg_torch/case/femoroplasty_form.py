@@ -23,7 +23,7 @@ from femoreg_torch.case.femoroplasty import (
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.model import Case, Side, View
 from femoreg_torch.case.models import MODEL_KEYS, read_model
-from femoreg_torch.case.objects import check_guide, checked_path
+from femoreg_torch.case.objects import check_guide, checked_path, plan_points
 from femoreg_torch.case.parts import (
     read_bones,
     read_carm,
@@ -94,7 +94,8 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
     views = tuple(_view(view, folder) for view in top.mappings("views")) if "views" in top else ()
     device = _device(top.mapping("device"), folder) if "device" in top else None
     objects = femoroplasty_objects(side, landmarks[head], device)
-    plan = top.mapping("plan").only("entry_point", "target")
+    plan, file = plan_points(top.mapping("plan").only("file", "entry_point", "target"), folder, side)
+    path = planned(side, plan.point("entry_point"), _target(plan, landmarks, side), device, file)
     return Case(
         folder=folder,
         carm=read_carm(top),
@@ -105,7 +106,7 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
         labels_path=ct.file_path("labels", folder) if "labels" in ct else None,
         bones=bones,
         landmarks=landmarks,
-        plan=checked_path(planned(side, plan.point("entry_point"), _target(plan, landmarks, side), device), plan),
+        plan=checked_path(path, plan),
         truth=read_truth(top, folder, list(objects), len(views)),
         template=TEMPLATE,
         side=side,

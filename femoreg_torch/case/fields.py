@@ -89,6 +89,10 @@ class Fields:
         """The point (3,), float64, under `key`."""
         return self._numbers(key, (3,), "a point [x, y, z] in mm")
 
+    def matrix(self, key: str, shape: tuple[int, int]) -> Tensor:
+        """The matrix of finite numbers, float64, under `key`."""
+        return self._numbers(key, shape, f"a matrix of {shape[0]} × {shape[1]} numbers")
+
     def transform(self, key: str) -> Tensor:
         """The rigid 4×4 transform, float64, under `key`."""
         return check_rigid(self._numbers(key, (4, 4), "a 4×4 matrix"), self.where(key))

@@ -113,6 +113,7 @@ class PlannedPath:
     entry_point: Tensor  # (3,) in the object's space
     target: Tensor  # (3,)
     tool: str | None = None  # the object whose points `base` and `tip` are the guide's
+    file: Path | None = None  # the plan.json of `femoreg plan` that it is from
 
 
 @dataclass(frozen=True, eq=False)

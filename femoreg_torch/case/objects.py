@@ -8,9 +8,10 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import Anatomy, LabelTable
 from femoreg_torch.case.fields import Fields
-from femoreg_torch.case.model import CaseObject, PlannedPath, Start
+from femoreg_torch.case.model import CaseObject, PlannedPath, Side, Start
 from femoreg_torch.case.models import MODEL_KEYS, is_model, read_model
 from femoreg_torch.errors import InputError
+from femoreg_torch.files import read_json
 
 _BY_LANDMARKS = "landmarks"
 _RESERVED = ("all", "each", "view", "views", "intrinsics", "camera1")  # words of presets, and of names of poses
@@ -97,9 +98,31 @@ def _start(entry: Fields) -> Start:
     return Start(beside=beside, beside_from_object=start.transform("beside_from_object"))
 
 
-def read_plan(plan: Fields, objects: Mapping[str, CaseObject], landmarks: Mapping[str, Tensor]) -> PlannedPath:
+def plan_points(plan: Fields, folder: Path, side: Side | None = None) -> tuple[Fields, Path | None]:
+    """Where `entry_point` and `target` stand: in the case, or in the `plan.json` that it names under `file`, and that.
+
+    Raises `InputError` for a file that is no plan, or one for the other side, or points that are given twice.
+    """
+    if "file" not in plan:
+        return plan, None
+    for key in ("entry_point", "target"):
+        if key in plan:
+            raise InputError(f"{plan.where(key)}: stands in the `file` of the plan already. Keep one of them.")
+    path = plan.file_path("file", folder)
+    content = Fields(read_json(path), str(path))
+    planned = content.content.get("side")
+    if side is not None and planned not in (None, side):
+        raise InputError(
+            f"{plan.where('file')}: {path} is a plan for the {planned} femur, the case is of the {side} side."
+        )
+    return content.mapping("plan"), path
+
+
+def read_plan(
+    plan: Fields, folder: Path, objects: Mapping[str, CaseObject], landmarks: Mapping[str, Tensor]
+) -> PlannedPath:
     """The planned path of a case whose objects are written out. Raises `InputError`."""
-    plan.only("object", "entry_point", "target", "tool")
+    plan.only("object", "file", "entry_point", "target", "tool")
     name = plan.choice("object", tuple(objects))
     tool = plan.choice("tool", tuple(objects)) if "tool" in plan else None
     if tool is not None and not {"tip", "base"} <= set(objects[tool].points):
@@ -108,17 +131,18 @@ def read_plan(plan: Fields, objects: Mapping[str, CaseObject], landmarks: Mappin
         )
     if tool is not None:
         check_guide(objects[tool].points, f"{plan.where('tool')}: {tool}")
-    target = plan.value("target", "a landmark or a point [x, y, z]")
+    points, file = plan_points(plan, folder)
+    target = points.value("target", "a landmark or a point [x, y, z]")
     if isinstance(target, str):
         known = {**landmarks, **objects[name].points}
         if target not in known:
             raise InputError(
-                f"{plan.where('target')}: there is no point {target[:60]!r}. There are: {', '.join(known)}."
+                f"{points.where('target')}: there is no point {target[:60]!r}. There are: {', '.join(known)}."
             )
         end = known[target]
     else:
-        end = plan.point("target")
-    return checked_path(PlannedPath(name, plan.point("entry_point"), end, tool), plan)
+        end = points.point("target")
+    return checked_path(PlannedPath(name, points.point("entry_point"), end, tool, file), points)
 
 
 def checked_path(path: PlannedPath, plan: Fields) -> PlannedPath:

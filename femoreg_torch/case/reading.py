@@ -72,7 +72,7 @@ def _read_objects(top: Fields, folder: Path) -> Case:
         labels_path=ct.file_path("labels", folder) if ct and "labels" in ct else None,
         bones=bones,
         landmarks=landmarks,
-        plan=read_plan(top.mapping("plan"), objects, landmarks) if "plan" in top else None,
+        plan=read_plan(top.mapping("plan"), folder, objects, landmarks) if "plan" in top else None,
         truth=read_truth(top, folder, list(objects), len(views)),
     )
 

@@ -47,6 +47,9 @@ class Result:
     path: tuple[str, str | None] | None = None  # the object with the planned path, and the tool that is to follow it
     points_camera1: dict[str, Tensor] = field(default_factory=dict)  # (3,): entry_point, tip
     directions_camera1: dict[str, Tensor] = field(default_factory=dict)  # (3,) unit vectors: path, guide
+    # (6, 6) of the motion by which the tool, brought onto the planned path, would miss it: mm at the entry point, then
+    # degrees about it, along the axes of the object with the path (LPS for a bone). None without a registered tool.
+    path_covariance: Tensor | None = None
     timings_s: dict[str, float] = field(default_factory=dict)
     preset: str = ""
     seed: int = 0

@@ -32,6 +32,7 @@ def result_content(result: Result) -> dict[str, Any]:
     content |= {
         "points_camera1": result.points_camera1,
         "directions_camera1": result.directions_camera1,
+        **({} if result.path_covariance is None else {"path_covariance": result.path_covariance}),
         "quality": {name: asdict(value) for name, value in result.quality.items()},
         "trusted": result.verdict.trusted,
         "reasons": result.verdict.reasons,
@@ -105,6 +106,7 @@ def read_result(run: Path) -> Result:
         path=_path(top, names),
         points_camera1=_vectors(top, "points_camera1"),
         directions_camera1=_directions(top),
+        path_covariance=top.matrix("path_covariance", (6, 6)) if "path_covariance" in top else None,
         timings_s=_numbers(top, "timings_s"),
         preset=str(top.content.get("preset", "")),
         seed=int(top.number("seed")) if "seed" in top else 0,

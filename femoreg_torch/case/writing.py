@@ -44,7 +44,7 @@ def write_case(folder: Path, case: Case, standing: Path | None = None) -> None:
     else:
         content["objects"] = {name: _object(thing, base) for name, thing in case.objects.items()}
         if case.plan is not None:
-            content["plan"] = _plan(case.plan)
+            content["plan"] = _plan(case.plan, base)
     content["carm"] = _carm(case.carm)
     if case.views:
         content["views"] = [_view(view, base, case.template is not None) for view in case.views]
@@ -79,13 +79,21 @@ def _bones(bones: LabelTable) -> str | dict[str, int | list[int]]:
 
 def _femoroplasty(case: Case, folder: Path) -> dict[str, Any]:
     assert case.plan is not None  # the template has both
-    assert case.side is not None
-    at_head = torch.equal(case.plan.target, case.landmarks[femoral_head(case.side)])
-    target: str | Tensor = femoral_head(case.side).rpartition("-")[0] if at_head else case.plan.target
-    content: dict[str, Any] = {"plan": {"entry_point": case.plan.entry_point, "target": target}}
+    if case.plan.file is not None:
+        content: dict[str, Any] = {"plan": {"file": _relative(case.plan.file, folder)}}
+    else:
+        content = {"plan": _points_of(case, case.plan)}
     if (device := device_of(case)) is not None:
         content[DEVICE] = _device(device, folder)
     return content
+
+
+def _points_of(case: Case, plan: PlannedPath) -> dict[str, Any]:
+    """Entry point and target, which is told as the landmark where it is the head's centre."""
+    assert case.side is not None
+    at_head = torch.equal(plan.target, case.landmarks[femoral_head(case.side)])
+    target: str | Tensor = femoral_head(case.side).rpartition("-")[0] if at_head else plan.target
+    return {"entry_point": plan.entry_point, "target": target}
 
 
 def _device(device: Device, folder: Path) -> dict[str, Any]:
@@ -135,8 +143,10 @@ def _start(start: Start) -> Any:
     return {"beside": start.beside} | ({"beside_from_object": start.beside_from_object} if moved else {})
 
 
-def _plan(plan: PlannedPath) -> dict[str, Any]:
+def _plan(plan: PlannedPath, folder: Path) -> dict[str, Any]:
     tool = {} if plan.tool is None else {"tool": plan.tool}
+    if plan.file is not None:
+        return {"object": plan.object, "file": _relative(plan.file, folder)} | tool
     return {"object": plan.object, "entry_point": plan.entry_point, "target": plan.target} | tool
 
 

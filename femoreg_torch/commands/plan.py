@@ -52,10 +52,11 @@ def plan(case: Path, *, out: Path, volume_ml: float = 9.5, preset: str = "defaul
 
 
 def plan_offsets(plan: Path, *, distance_mm: float | None = None, case: Path | None = None) -> None:
-    """Move a plan by some mm in six directions and tell what is left of its gain.
+    """Move a plan by some mm in six directions, and its end in four, and tell what is left of its gain.
 
-    Writes offsets.json and offsets.png into PLAN. Cement spreads anew from the moved path, or is moved itself, as
-    `offsets.moves` of the plan's settings says.
+    Writes offsets.json and offsets.png into PLAN, and into its plan.json a quadratic through these loads, by which
+    `femoreg register` tells what an uncertain registration costs. Cement spreads anew from the moved path, or is moved
+    itself, as `offsets.moves` of the plan's settings says.
 
     Args:
         plan: Folder that `femoreg plan` wrote.
@@ -65,21 +66,27 @@ def plan_offsets(plan: Path, *, distance_mm: float | None = None, case: Path | N
     from rich.console import Console
 
     from femoreg_torch.commands.telling import progress_report
+    from femoreg_torch.errors import InputError
     from femoreg_torch.files import write_json
     from femoreg_torch.planning.figures import offsets_figure, save
-    from femoreg_torch.planning.offsets import directions
+    from femoreg_torch.planning.offsets import directions, turned_ends
     from femoreg_torch.planning.replan import Replan
+    from femoreg_torch.planning.report import add_response
 
     console = Console()
     again = Replan(plan, case)
     far = again.stored.planning.offsets.distance_mm if distance_mm is None else distance_mm
+    if not far > 0:
+        raise InputError(f"--distance-mm: a number above 0 was expected, found {far:g}.")
     wanted = {name: far * way for name, way in directions(again.side).items()}
+    wanted |= turned_ends(again.stored.path, far)
     with progress_report(console, "offsets") as report:
         outcomes = {}
         for n, (name, offset) in enumerate(wanted.items()):
             report(name, n / len(wanted))
             outcomes[name] = again.at(offset)
     write_json(plan / "offsets.json", again.content({name: [o] for name, o in outcomes.items()}) | {"distance_mm": far})
+    add_response(plan, again.response(outcomes, far))
     save(offsets_figure(outcomes, again.baseline_n, again.planned_n), plan / "offsets.png")
     console.print(f"As planned: {again.planned_n:.0f} N ({again.gain(again.planned_n):+.1f} %, modelled).")
     for name, outcome in outcomes.items():
@@ -87,15 +94,27 @@ def plan_offsets(plan: Path, *, distance_mm: float | None = None, case: Path | N
 
 
 def plan_robustness(
-    plan: Path, *, study: Path, draws: int | None = None, seed: int = 0, case: Path | None = None
+    plan: Path,
+    *,
+    study: Path | None = None,
+    covariance: Path | None = None,
+    mean: list[float] | None = None,
+    draws: int | None = None,
+    seed: int = 0,
+    case: Path | None = None,
 ) -> None:
-    """Carry a plan out under the errors of a study's registrations, and tell how its gain is distributed.
+    """Carry a plan out under errors of registration, shifts and turns, and tell how its gain is distributed.
 
-    Writes robustness.json and robustness.png into PLAN. Errors are drawn from the trusted runs of the study.
+    Writes robustness.json and robustness.png into PLAN. Errors are drawn from the trusted runs of a study, or from a
+    normal distribution.
 
     Args:
         plan: Folder that `femoreg plan` wrote.
-        study: Folder with runs.parquet or runs.csv, with signed errors of femur and device along each axis.
+        study: Folder with runs.parquet or runs.csv, with signed errors of entry point and tip (or femur and device)
+            along each axis, and of the turns.
+        covariance: In place of a study: a text file with 3 × 3 numbers (mm², LPS) or 6 × 6 (mm at the entry point, then
+            degrees about it), or a result.json of `femoreg register`, which holds the covariance of its path.
+        mean: With it, the mean of the errors, as [x, y, z] or six numbers; zeros if not given.
         draws: How many; as in the plan's settings if not given.
         seed: Of the draws.
         case: Folder of the case, if it is no longer where it was planned from.
@@ -107,7 +126,7 @@ def plan_robustness(
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import write_json
     from femoreg_torch.planning.figures import robustness_figure, save
-    from femoreg_torch.planning.offsets import study_offsets
+    from femoreg_torch.planning.offsets import normal_moves, read_covariance, study_moves
     from femoreg_torch.planning.replan import Replan
     from femoreg_torch.planning.report import read_plan
 
@@ -115,13 +134,22 @@ def plan_robustness(
     count = read_plan(plan).planning.robustness.draws if draws is None else draws
     if count < 1:
         raise InputError(f"--draws: 1 or more was expected, found {count}.")
-    offsets = study_offsets(study, count, seed)  # first: the femur takes a while
+    if (study is None) == (covariance is None):
+        raise InputError("plan-robustness: either --study or --covariance was expected.")
+    if study is not None:
+        if mean is not None:
+            raise InputError("--mean: belongs to --covariance; a study has its own.")
+        moves = study_moves(study, count, seed)  # first: the femur takes a while
+    else:
+        assert covariance is not None  # one of the two
+        variance = read_covariance(covariance)
+        moves = normal_moves(np.zeros(len(variance)) if mean is None else np.array(mean), variance, count, seed)
     again = Replan(plan, case)
     with progress_report(console, "draws") as report:
         outcomes = []
-        for n, offset in enumerate(offsets):
-            report(f"draw {n + 1} of {len(offsets)}", n / len(offsets))
-            outcomes.append(again.at(offset))
+        for n, move in enumerate(moves):
+            report(f"draw {n + 1} of {len(moves)}", n / len(moves))
+            outcomes.append(again.at(move))
     gains = [again.gain(outcome.yield_load_n) for outcome in outcomes]
     low, middle, high = np.percentile(gains, [5, 50, 95])
     spread = {"gain_percent_p5": low, "gain_percent_median": middle, "gain_percent_p95": high, "seed": seed}
@@ -129,6 +157,6 @@ def plan_robustness(
     save(robustness_figure(outcomes, again.baseline_n, again.planned_n), plan / "robustness.png")
     least = min(outcome.clearance_mm for outcome in outcomes)
     console.print(
-        f"Modelled gain {again.gain(again.planned_n):+.1f} % as planned; under the study's errors {middle:+.1f} % "
+        f"Modelled gain {again.gain(again.planned_n):+.1f} % as planned; under these errors {middle:+.1f} % "
         f"(5 to 95 %: {low:+.1f} to {high:+.1f} %). Least clearance {least:.1f} mm."
     )

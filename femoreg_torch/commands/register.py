@@ -28,7 +28,9 @@ def register(
     Landmarks found by the network in view 1 start the bones; the steps of the preset do the rest. Writes result.json
     with all poses, their quality and, where the case has a truth, their errors; and where a tool with a guide was
     registered, the motion that brings it onto the planned path: navigation.json and navigation/, see `femoreg navigate
-    --help`. `femoreg evaluate` makes pictures of the result, `femoreg replay` shows how it came about.
+    --help`. Where the case's path is from `femoreg plan` (`plan: {file: PLAN/plan.json}`) and `femoreg plan-offsets`
+    was run, it tells what the registration's uncertainty leaves of the modelled gain. `femoreg evaluate` makes pictures
+    of the result, `femoreg replay` shows how it came about.
 
     Args:
         case: Case folder with case.yaml.
@@ -51,13 +53,15 @@ def register(
     from rich.console import Console
     from rich.markup import escape
 
-    from femoreg_torch.case import RESULT_NAME
+    from femoreg_torch.case import RESULT_NAME, read_case
     from femoreg_torch.commands.status import NOT_TRUSTED
     from femoreg_torch.commands.telling import progress_report, tell_device, tell_verdict
     from femoreg_torch.navigation import summary
+    from femoreg_torch.planning.quote import quoted_gain, response_of
 
     console = Console()
     place = tell_device(console, device)
+    response = response_of(read_case(case))
     with progress_report(console, "reading the case") as report:
         result, navigation = register_into(
             out,
@@ -72,6 +76,9 @@ def register(
             report=report,
         )
     tell_verdict(console, result)
+    quoted = quoted_gain(response, result)
+    if quoted is not None:
+        console.print(quoted.sentence)
     for line in [] if navigation is None else summary(navigation):
         console.print(line)
     console.print(f"Result written to {escape(str(out / RESULT_NAME))} ({result.timings_s['total']:.0f} s).")

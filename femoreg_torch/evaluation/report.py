@@ -10,6 +10,7 @@ import cv2
 
 from femoreg_torch.case import Case, Result, Verdict
 from femoreg_torch.evaluation.overlay import Picture
+from femoreg_torch.evaluation.planning_section import planning_section
 from femoreg_torch.evaluation.table import METRIC_COLUMNS, POSE_COLUMNS, metric_rows, pose_rows
 
 _STYLE = """
@@ -54,6 +55,7 @@ def report_page(case: Case, result: Result, errors: dict[str, Any] | None, overl
             _table(POSE_COLUMNS, pose_rows(errors)),
         ]
     parts += ["<h2>Overlays</h2>", _figure(overlay, case), "<h2>Result</h2>", _points(result)]
+    parts.append(planning_section(case, result))
     parts += ["<h2>Quality</h2>", _QUALITY_NOTE, _table(_QUALITY_COLUMNS, _quality(result))]
     if result.cameras:
         parts += ["<h2>C-arm</h2>", _CAMERA_NOTE, _table(_CAMERA_COLUMNS, _cameras(result))]

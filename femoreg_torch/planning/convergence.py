@@ -1,7 +1,8 @@
-"""The same femur and cement on meshes of other sizes: how far loads and gain hang on the mesh."""
+"""The same femur and cement on a mesh of another size: how far load and gain hang on the mesh, and what it costs."""
 
 import dataclasses
-from collections.abc import Sequence
+import time
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +15,29 @@ from femoreg_torch.planning.prepare import Prepared
 Array = NDArray[np.float64]
 
 
-def on_meshes(prepared: Prepared, cement: Array, sizes_mm: Sequence[float]) -> list[tuple[float, float, float]]:
-    """Size mm, yield load without cement N, and gain of the cement (X, Y, Z), for each size of the elements.
+@dataclass(frozen=True)
+class MeshRow:
+    """One mesh."""
+
+    size_mm: float  # edge of its elements
+    elements: int
+    baseline_n: float  # yield load without cement
+    gain: float  # of the cement, over that
+    seconds: float  # of processor time for one curve, the mean of the two
+
+
+def on_mesh(prepared: Prepared, cement: Array, size_mm: float) -> MeshRow:
+    """Yield load without cement, and gain of the cement (X, Y, Z), with elements of some size.
 
     Raises `InputError` for a mesh with more elements than the settings allow.
     """
     bone, planning = prepared.bone, prepared.planning
-    rows = []
-    for size in sizes_mm:
-        model = make_model(bone, planning, size)
-        loading = make_loading(model.mesh, bone.femur.frame, planning.load)
-        press = Press(model.mesh, loading, planning.bone.poisson, planning.load.pad_modulus_mpa)
-        other = dataclasses.replace(prepared, model=model, press=press)
-        without = other.curve().yield_load_n
-        rows.append((float(size), without, other.curve(cement).yield_load_n / without - 1))
-    return rows
+    model = make_model(bone, planning, size_mm)
+    loading = make_loading(model.mesh, bone.femur.frame, planning.load)
+    press = Press(model.mesh, loading, planning.bone.poisson, planning.load.pad_modulus_mpa)
+    other = dataclasses.replace(prepared, model=model, press=press)
+    began = time.process_time()
+    without = other.curve().yield_load_n
+    gain = other.curve(cement).yield_load_n / without - 1
+    seconds = (time.process_time() - began) / 2
+    return MeshRow(float(size_mm), len(model.mesh.elements), without, gain, seconds)

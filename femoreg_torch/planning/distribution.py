@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from femoreg_torch.planning.curve import Curve, Press
+from femoreg_torch.planning.laws import Material
 from femoreg_torch.planning.model import Bone, Model, check_volume, with_cement
 from femoreg_torch.planning.settings import Planning
 
@@ -15,11 +16,30 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
+class Mechanism:
+    """A way in which a femur gives way, and the load at which it did, with the cement that it then held."""
+
+    load_n: float
+    plastic: Array  # (E,) plastic strain at the end of the curve
+    strength: Array  # (E,) MPa, with the cement
+
+    def bound(self, bone_strength: Array, gain: Array) -> tuple[float, Array]:
+        """The most that any femur can bear before it gives way in this way: what bone alone bears, N, and more (E,).
+
+        The second is what replacing all of an element by cement adds, `gain` (E,) being its rise of strength. By the
+        kinematic theorem of plastic collapse no cement helps beyond the least of such bounds: the load of a mechanism
+        is the work that strength does on its strains, which is linear in where cement is.
+        """
+        per_work = self.load_n / float(self.strength @ self.plastic)
+        return per_work * float(bone_strength @ self.plastic), per_work * gain * self.plastic
+
+
+@dataclass(frozen=True, eq=False)
 class Distribution:
     """The free optimum."""
 
     cement: Array  # (X, Y, Z) share of the voxels' pores
-    worth: Array  # (BX, BY, BZ) of the blocks: what cement there adds, summed up over the steps, 1 at most
+    mechanisms: tuple[Mechanism, ...]  # of each step, from none to all
     baseline: Curve  # without cement
     curve: Curve  # with all of it
     loads_n: tuple[float, ...]  # yield loads after each step, from none to all
@@ -46,7 +66,7 @@ def optimise(
     grid = model.grid
     room = grid.mean(bone.pores) * grid.size_mm**3 / 1000  # ml of cement that a block takes
     placed = np.zeros(room.shape)  # of that, 0 to 1
-    worth = np.zeros(room.shape)
+    materials = [model.material]
     curves = [press.curve(model.material, planning.curve)]
     share = np.zeros(bone.pores.shape)
     for step in range(settings.steps):
@@ -59,13 +79,19 @@ def optimise(
             gain = press.energy(material, u) * stiffer
         gain = np.where(press.loading.caps, 0.0, gain)
         wanted = _smoothed(model, gain, room > 0, settings.filter_mm)
-        worth += wanted / max(wanted.max(), 1e-30)
         _place(placed, room, wanted, volume_ml / settings.steps)
         share = np.clip(grid.spread(placed), 0, 1) * bone.marrow
         progress((step + 1) / settings.steps)
-        curves.append(press.curve(with_cement(model, bone, share, planning.cement), planning.curve))
+        materials.append(with_cement(model, bone, share, planning.cement))
+        curves.append(press.curve(materials[-1], planning.curve))
     loads = tuple(curve.yield_load_n for curve in curves)
-    return Distribution(share, worth / worth.max(), curves[0], curves[-1], loads)
+    ways = tuple(mechanism(curve, material) for curve, material in zip(curves, materials, strict=True))
+    return Distribution(share, ways, curves[0], curves[-1], loads)
+
+
+def mechanism(curve: Curve, material: Material) -> Mechanism:
+    """How a femur of this material gave way."""
+    return Mechanism(curve.yield_load_n, curve.plastic, material.tension)
 
 
 def _smoothed(model: Model, gain: Array, allowed: NDArray[np.bool_], filter_mm: float) -> Array:

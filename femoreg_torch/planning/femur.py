@@ -107,6 +107,8 @@ def cut_out(ct: Volume, labels: Volume, bone: int, head: Array, side: Side, shaf
     affine = ct.lps_from_index.numpy().copy()
     affine[:3, 3] += affine[:3, :3] @ np.array(low, float)
     frame = _frame(whole, affine, np.asarray(head, float), side, shaft_mm)
+    if low[2] == 0:
+        _check_shaft_end(whole[:, :, 0], affine, frame, side, shaft_mm)
     return Femur(side, hu, whole, affine, (low[0], low[1], low[2]), frame)
 
 
@@ -121,6 +123,20 @@ def _check_cut(box: tuple[slice, ...], shape: tuple[int, ...], side: Side) -> No
             )
     if box[2].stop == shape[2]:
         raise InputError(f"label map: the {side} femur is cut off by the CT at the top. Use a scan of the whole head.")
+
+
+def _check_shaft_end(end: Mask, affine: Array, frame: Frame, side: Side, shaft_mm: float) -> None:
+    """Raises `InputError` if the last slice cuts the shaft of a bent leg askew."""
+    places = np.argwhere(end)
+    if not len(places):
+        return
+    points = np.c_[places, np.zeros(len(places))] @ affine[:3, :3].T + affine[:3, 3]
+    highest = float(((points - frame.head) @ frame.proximal).max())
+    if highest > -shaft_mm:
+        raise InputError(
+            f"CT: its last slice cuts the {side} femur askew, on one side {-highest:.0f} mm below the centre of its "
+            f"head, but {shaft_mm:.0f} mm are needed all around. Use a longer scan."
+        )
 
 
 def _one_piece(mask: Mask, side: Side) -> Mask:
@@ -156,11 +172,8 @@ def _frame(mask: Mask, affine: Array, head: Array, side: Side, shaft_mm: float) 
         along = points @ proximal
         lowest = float(along.min())
         end = max(lowest, -SHAFT_FROM_MM - _SHAFT_MM)
-        if lowest > -max(shaft_mm, SHAFT_FROM_MM + _LEAST_SHAFT_MM):
-            raise InputError(
-                f"CT: it shows the {side} femur to {-lowest:.0f} mm below the centre of its head, but "
-                f"{max(shaft_mm, SHAFT_FROM_MM + _LEAST_SHAFT_MM):.0f} mm are needed. Use a longer scan."
-            )
+        if lowest > -SHAFT_FROM_MM - _LEAST_SHAFT_MM:
+            raise _too_short(side, lowest, shaft_mm)
         within = (along < -SHAFT_FROM_MM) & (along > end + 5)
         level = np.floor(along[within] / 2).astype(int)
         level -= level.min()
@@ -170,8 +183,18 @@ def _frame(mask: Mask, affine: Array, head: Array, side: Side, shaft_mm: float) 
         middle = centres.mean(0)
         axis = np.linalg.svd(centres - middle)[2][0]
         proximal = axis if axis @ proximal > 0 else -axis
+    lowest = float((points @ proximal).min())
+    if lowest > -shaft_mm:
+        raise _too_short(side, lowest, shaft_mm)
     shaft = middle - proximal * (middle @ proximal)  # its axis at the head's level
     lateral = shaft / np.linalg.norm(shaft)
     # +L × … : prox × lateral points back on the left, where lateral is +L, and to the front on the right
     posterior = np.cross(proximal, lateral) * (1 if side == "left" else -1)
     return Frame(head, radius, proximal, lateral, posterior, head + shaft)
+
+
+def _too_short(side: Side, lowest: float, shaft_mm: float) -> InputError:
+    return InputError(
+        f"CT: it shows the {side} femur to {-lowest:.0f} mm below the centre of its head, but "
+        f"{max(shaft_mm, SHAFT_FROM_MM + _LEAST_SHAFT_MM):.0f} mm are needed. Use a longer scan."
+    )

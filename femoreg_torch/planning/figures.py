@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from femoreg_torch.files import temporary_file
+from femoreg_torch.planning.convergence import MeshRow
 from femoreg_torch.planning.curve import Curve
 from femoreg_torch.planning.offsets import Outcome
 from femoreg_torch.planning.plan import FemoroplastyPlan
@@ -69,6 +70,7 @@ def offsets_figure(outcomes: Mapping[str, Outcome], baseline_n: float, planned_n
     axis = figure.subplots()
     gains = [100 * (outcome.yield_load_n / baseline_n - 1) for outcome in outcomes.values()]
     axis.bar(list(outcomes), gains, color="#3b6ea5")
+    axis.tick_params(axis="x", rotation=30)
     axis.axhline(100 * (planned_n / baseline_n - 1), color="#c0602b", label="as planned")
     axis.set(ylabel="gain of yield load, %", title="Plan carried out beside its place, modelled")
     axis.legend(loc="lower right")
@@ -90,14 +92,16 @@ def robustness_figure(outcomes: Sequence[Outcome], baseline_n: float, planned_n:
     return figure
 
 
-def mesh_figure(rows: Sequence[tuple[float, float, float]]) -> Figure:
-    """Yield load without cement, and gain, over the size of the elements: rows of size mm, load N, gain."""
-    figure = Figure(figsize=(10, 4.5), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    size, load, gain = np.array(rows).T
+def mesh_figure(rows: Sequence[MeshRow]) -> Figure:
+    """Yield load without cement, and gain, over the size of the elements; time over their number."""
+    figure = Figure(figsize=(14, 4.5), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    size, load, gain = ([getattr(row, name) for row in rows] for name in ("size_mm", "baseline_n", "gain"))
     left.plot(size, load, "o-", color="#3b6ea5")
-    left.set(xlabel="elements, mm", ylabel="yield load without cement, N", ylim=(0, 1.15 * load.max()))
-    right.plot(size, 100 * gain, "o-", color="#c0602b")
-    right.set(xlabel="elements, mm", ylabel="gain of the same cement, %", ylim=(0, 115 * gain.max()))
+    left.set(xlabel="elements, mm", ylabel="yield load without cement, N", ylim=(0, 1.15 * max(load)))
+    middle.plot(size, [100 * value for value in gain], "o-", color="#c0602b")
+    middle.set(xlabel="elements, mm", ylabel="gain of the same cement, %", ylim=(0, 115 * max(gain)))
+    right.loglog([row.elements for row in rows], [row.seconds for row in rows], "o-", color="#444444")
+    right.set(xlabel="elements", ylabel="processor time of one curve, s")
     figure.suptitle("The same femur and cement on finer meshes, modelled")
     return figure

@@ -1,5 +1,6 @@
-"""What a plan is worth when it is carried out some mm beside: in six directions, and under errors of registration."""
+"""What a plan is worth when it is carried out some mm or degrees beside, and under errors of registration."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path as File
@@ -8,9 +9,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from femoreg_torch.case.model import Side
 from femoreg_torch.errors import InputError
+from femoreg_torch.files import read_json
 from femoreg_torch.planning.diffusion import diffuse
 from femoreg_torch.planning.path import Ellipsoid, Path, Surroundings
 from femoreg_torch.planning.prepare import Prepared
@@ -24,7 +27,8 @@ _AXES = ("lr", "ap", "is")  # of a study's signed columns, as LPS: to the left, 
 class Outcome:
     """A plan carried out beside its place."""
 
-    offset_mm: tuple[float, float, float]  # LPS
+    offset_mm: tuple[float, float, float]  # LPS, at the entry point
+    turn_deg: tuple[float, float, float]  # about the axes of LPS through the entry point
     yield_load_n: float
     clearance_mm: float  # of the path to the surface, but near the entry; below 0 it leaves the bone
     cement_ml: float
@@ -39,61 +43,138 @@ def directions(side: Side) -> dict[str, Array]:
     }  # fmt: skip
 
 
+def turned_ends(path: Path, distance_mm: float) -> dict[str, Array]:
+    """Moves (6,) that leave the entry point and bring the path's end a distance up, down, to the front and to the back.
+
+    Square to the path, as seen along it.
+    """
+    up, front = end_axes(path.entry, path.target)
+    ways = {"end superior": up, "end inferior": -up, "end anterior": front, "end posterior": -front}
+    angle = math.degrees(distance_mm / path.length_mm)
+    return {name: np.concatenate([np.zeros(3), angle * np.cross(path.direction, way)]) for name, way in ways.items()}
+
+
+def end_axes(entry: Array, target: Array) -> tuple[Array, Array]:
+    """Unit vectors (3,), LPS, square to a path: the one that points most to the head, and that to the front."""
+    along = (target - entry) / np.linalg.norm(target - entry)
+    up = np.array([0, 0, 1.0]) - along[2] * along
+    up = up / np.linalg.norm(up)
+    front = np.cross(along, up)
+    return up, front * (-1 if front[1] > 0 else 1)
+
+
+def moved_by(entry: Array, move: Array) -> Array:
+    """The motion (4, 4) of LPS space: a turn about the entry point by degrees move[3:], then a shift by mm move[:3]."""
+    found = np.eye(4)
+    found[:3, :3] = Rotation.from_rotvec(move[3:], degrees=True).as_matrix()
+    found[:3, 3] = entry - found[:3, :3] @ entry + move[:3]
+    return found
+
+
 def carried_out(
     prepared: Prepared,
     around: Surroundings,
     path: Path,
     cement: Array,
-    offset: Array,
+    move: Array,
     moves: Literal["path", "pattern"],
 ) -> Outcome:
-    """The plan moved by an offset (3,), LPS mm.
+    """The plan moved (6,): by mm, LPS, and turned about its entry point by degrees about the axes of LPS.
 
     path: the path is moved, and cement spreads from it anew. pattern: the cement (X, Y, Z) itself is moved, and what
     would come to lie outside the marrow is lost. Raises `InputError` where a moved injection finds no marrow.
     """
-    moved = Path(path.entry + offset, path.target + offset, tuple(Ellipsoid(**vars(e)) for e in path.ellipsoids))
+    motion = moved_by(path.entry, move)
+    entry, target = (motion[:3, :3] @ point + motion[:3, 3] for point in (path.entry, path.target))
+    moved = Path(entry, target, tuple(Ellipsoid(**vars(e)) for e in path.ellipsoids))
     if moves == "pattern":
-        shift = np.linalg.solve(prepared.bone.femur.lps_from_index[:3, :3], offset)
-        there = ndimage.shift(cement, shift, order=1, mode="constant") * prepared.bone.marrow
+        affine = prepared.bone.femur.lps_from_index
+        back = np.linalg.inv(affine) @ np.linalg.inv(motion) @ affine
+        there = ndimage.affine_transform(cement, back[:3, :3], back[:3, 3], order=1, mode="constant")
+        there = there * prepared.bone.marrow
     else:
         there = diffuse(prepared.bone, moved.injections(), prepared.planning.diffusion)
     load = prepared.curve(there).yield_load_n
     clearance = around.clearances(moved, prepared.planning.path).cortex_mm
-    x, y, z = (float(v) for v in offset)
-    return Outcome((x, y, z), load, clearance, prepared.bone.cement_ml(there))
+    x, y, z, a, b, c = (float(v) for v in move)
+    return Outcome((x, y, z), (a, b, c), load, clearance, prepared.bone.cement_ml(there))
 
 
-def normal_offsets(mean: Array, covariance: Array, draws: int, seed: int) -> Array:
-    """Random offsets (draws, 3), LPS mm, of a normal distribution. Raises `InputError` for what is no covariance."""
+def normal_moves(mean: Array, covariance: Array, draws: int, seed: int) -> Array:
+    """Random moves (draws, 6) of a normal distribution: mm along LPS at the entry point, then degrees about LPS.
+
+    Mean and covariance are of 6 values, or of 3 for mm alone. Raises `InputError` for what is no covariance.
+    """
     mean, covariance = np.asarray(mean, float), np.asarray(covariance, float)
-    right = mean.shape == (3,) and covariance.shape == (3, 3) and np.allclose(covariance, covariance.T)
-    if not right or np.linalg.eigvalsh(covariance).min() < -1e-9:
-        raise InputError("errors: a mean of 3 values and a symmetric 3 × 3 covariance, in mm, were expected.")
-    return np.random.default_rng(seed).multivariate_normal(mean, covariance, size=draws)
+    count = len(covariance)
+    if count not in (3, 6) or covariance.shape != (count, count) or not np.isfinite(covariance).all():
+        raise InputError(
+            f"covariance: 3 × 3 (mm², LPS) or 6 × 6 numbers (mm, then degrees) were expected, found {covariance.shape}."
+        )
+    if mean.shape != (count,) or not np.isfinite(mean).all():
+        raise InputError(f"mean: {count} numbers were expected, as many as the covariance has rows, found {mean.size}.")
+    if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance).min() < -1e-9:
+        raise InputError("covariance: is not symmetric, or has a direction of variance below 0.")
+    drawn = np.zeros((draws, 6))
+    drawn[:, :count] = np.random.default_rng(seed).multivariate_normal(mean, covariance, size=draws)
+    return drawn
 
 
-def study_offsets(folder: File, draws: int, seed: int) -> Array:
-    """Offsets (draws, 3), LPS mm, drawn from the runs of a study with replacement.
+def read_covariance(file: File) -> Array:
+    """The covariance in a text file (rows of numbers, with spaces or commas between) or a registration's result.json.
 
-    `folder` holds `runs.parquet` or `runs.csv` with signed errors (estimate minus truth) `femur_mm_lr|ap|is` and
-    `device_mm_lr|ap|is`. The robot brings the device where both are believed to fit, so that it ends beside the
-    planned place in the bone by the femur's error minus the device's. Runs that were not trusted would not have been
-    carried out, and are left out. Raises `InputError` for a missing file or column, or if no run is left.
+    In a result it is `path_covariance`, of mm and degrees. Raises `InputError` for a file that holds neither.
+    """
+    file = File(file)
+    if not file.is_file():
+        raise InputError(f"{file}: there is no such file. Give the rows of a covariance as text, or a result.json.")
+    if file.suffix.lower() == ".json":
+        found = read_json(file).get("path_covariance")
+        if found is None:
+            raise InputError(f"{file}: has no path_covariance. Register a case with a planned path and its tool again.")
+        rows: Any = found
+    else:
+        rows = [
+            line.replace(",", " ").split() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()
+        ]
+    try:
+        return np.array(rows, float)
+    except ValueError as error:
+        raise InputError(f"{file}: rows of numbers, all of one length, were expected.") from error
+
+
+def study_moves(folder: File, draws: int, seed: int) -> Array:
+    """Moves (draws, 6), mm and degrees, drawn from the runs of a study with replacement.
+
+    `folder` holds `runs.parquet` or `runs.csv` with signed errors (estimate minus truth). The robot brings the device
+    where both are believed to fit, so that it ends beside the planned place in the bone by the bone's error minus the
+    device's: at the entry point by `entry_point_mm_lr|ap|is` minus `tip_mm_…`, or, in tables without these, by
+    `femur_mm_…` minus `device_mm_…` at their reference points; turned by `femur_deg_…` minus `device_deg_…`, where both
+    are there. The axes are those of the first view, taken for the patient's: left, back, head. Runs that were not
+    trusted would not have been carried out, and are left out. Raises `InputError` for a missing file or column, or if
+    no run is left.
     """
     table = _read_runs(folder)
-    columns = [f"{name}_mm_{axis}" for name in ("femur", "device") for axis in _AXES]
+    exact = all(f"{name}_mm_{axis}" in table for name in ("entry_point", "tip") for axis in _AXES)
+    pair = ("entry_point", "tip") if exact else ("femur", "device")
+    columns = [f"{name}_mm_{axis}" for name in pair for axis in _AXES]
     missing = [name for name in columns if name not in table]
     if missing:
         raise InputError(f"{folder}: the runs have no column {missing[0]}. Signed errors along each axis are needed.")
+    turns = [f"{name}_deg_{axis}" for name in ("femur", "device") for axis in _AXES]
+    columns += turns if all(name in table for name in turns) else []
     values = np.array([table[name] for name in columns], float).T
     kept = np.isfinite(values).all(1)
     if "trusted" in table:
         kept &= np.array([str(value).lower() in ("true", "1") for value in table["trusted"]])
     if not kept.any():
-        raise InputError(f"{folder}: no trusted run with errors of femur and device.")
-    offsets = values[kept, :3] - values[kept, 3:]
-    return np.asarray(offsets[np.random.default_rng(seed).integers(len(offsets), size=draws)])
+        raise InputError(f"{folder}: no trusted run with errors of {pair[0]} and {pair[1]}.")
+    values = values[kept]
+    found = np.zeros((len(values), 6))
+    found[:, :3] = values[:, :3] - values[:, 3:6]
+    if values.shape[1] > 6:
+        found[:, 3:] = values[:, 6:9] - values[:, 9:]
+    return np.asarray(found[np.random.default_rng(seed).integers(len(found), size=draws)])
 
 
 def _read_runs(folder: File) -> dict[str, Sequence[Any]]:

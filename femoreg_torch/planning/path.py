@@ -1,7 +1,7 @@
 """One drill path with ellipsoids of cement along it, that covers what is worth most under constraints."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +11,11 @@ from scipy.optimize import differential_evolution
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.diffusion import Injection
+from femoreg_torch.planning.distribution import Mechanism
 from femoreg_torch.planning.femur import Frame
 from femoreg_torch.planning.mesh import blocks
-from femoreg_torch.planning.model import Bone
-from femoreg_torch.planning.settings import PathSettings
+from femoreg_torch.planning.model import Bone, Model
+from femoreg_torch.planning.settings import CementSettings, PathSettings
 
 Array = NDArray[np.float64]
 
@@ -138,13 +139,38 @@ class Surroundings:
         return np.asarray(directions[int(depth.min(1).argmax())])
 
 
+def central_path(around: Surroundings, volume_ml: float, settings: PathSettings) -> Path:
+    """The path without a plan: along the neck's axis to the head's centre, a third of the cement at each quarter.
+
+    What a planned path is compared with (choice). Raises `InputError` if the axis of the neck does not leave the bone.
+    """
+    target = around.frame.head
+    entry = around.entry(target, around.neck)
+    if entry is None:
+        raise InputError("path: the axis of the neck does not leave the bone. Check label and head centre.")
+    length = float(np.linalg.norm(target - entry))
+    axis = settings.least_axis_mm
+    return Path(
+        entry, target, tuple(Ellipsoid(length * share, axis, axis, volume_ml / 3) for share in (0.75, 0.5, 0.25))
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Worth:
-    """Places in the marrow: where (N, 3), LPS mm, how much cement each takes (ml), what it is worth per ml."""
+    """Places in the marrow: where (N, 3), LPS mm, how much cement each takes (ml), and what it is worth.
+
+    Of each of K mechanisms: the load `base` (K,) that bone alone bears against it, over the load without cement, and
+    what a ml of cement in each place adds, `worth` (K, N).
+    """
 
     points: Array
     room_ml: Array
+    base: Array
     worth: Array
+
+    def load(self, room_ml: Array) -> float:
+        """The least load of all mechanisms with cement (N,) in ml, over the load without cement."""
+        return float((self.base + self.worth @ room_ml).min())
 
 
 def covered(
@@ -174,7 +200,6 @@ class Planner:
     def __init__(self, around: Surroundings, worth: Worth, volume_ml: float, settings: PathSettings) -> None:
         self.around, self.settings = around, settings
         self._worth, self._volume = worth, volume_ml
-        self._best = float(np.sort(worth.worth)[::-1][: max(1, len(worth.worth) // 10)].mean()) * volume_ml
         neck = around.neck
         side = np.cross(neck, around.frame.posterior)
         self._side = side / np.linalg.norm(side)
@@ -193,7 +218,7 @@ class Planner:
         return None if entry is None else Path(entry, target)
 
     def filled(self, x: Array, path: Path) -> tuple[Path, float]:
-        """The path with the cement of the parameters, and what that covers; 1 is about the most there is."""
+        """The path with the cement of the parameters, and the load that mechanisms allow, over that of bone alone."""
         count, settings, length, outward = self.settings.ellipsoids, self.settings, path.length_mm, -path.direction
         middles = path.target + (x[5 : 5 + count] * length)[:, None] * outward
         axes = np.exp(x[5 + count :]).reshape(count, 2)
@@ -205,7 +230,7 @@ class Planner:
         outside = (
             np.maximum(scaled - settings.most_axis_mm, 0).sum() + np.maximum(settings.least_axis_mm - scaled, 0).sum()
         )
-        value = float((room * self._worth.worth).sum()) / self._best - 0.1 * float(outside)
+        value = self._worth.load(room) - 0.1 * float(outside)
         made = [
             Ellipsoid(length * (1 - share), float(axis[0]), float(axis[1]), float(part))
             for share, axis, part in zip(x[5 : 5 + count], scaled, parts, strict=True)
@@ -216,6 +241,12 @@ class Planner:
         kept = [Ellipsoid(e.depth_mm, e.along_mm, e.across_mm, e.volume_ml * self._volume / whole) for e in made]
         return Path(path.entry, path.target, tuple(kept)), value
 
+    def path(self, x: Array) -> Path:
+        """The path of parameters that keep all limits, with its cement."""
+        drilled = self.drilled(x)
+        assert drilled is not None  # limits were kept
+        return self.filled(x, drilled)[0]
+
     def cost(self, x: Array) -> float:
         """What the search makes small: less than 0 where all limits are kept."""
         path = self.drilled(x)
@@ -224,10 +255,18 @@ class Planner:
         excess = self.around.clearances(path, self.settings).excess(self.settings)
         return 1.0 + excess if excess > 0 else -self.filled(x, path)[1]
 
-    def search(self, rng: np.random.Generator, progress: Callable[[float], None] = lambda share: None) -> Array:
-        """The best parameters (P,) by differential evolution. Raises `InputError` if no path keeps all limits."""
+    def search(
+        self,
+        rng: np.random.Generator,
+        progress: Callable[[float], None] = lambda share: None,
+        start: Array | None = None,
+    ) -> Array:
+        """The best parameters (P,) by differential evolution, in a third of the evaluations from a good `start`.
+
+        Raises `InputError` if no path keeps all limits.
+        """
         size = _POPULATION * len(self.bounds)
-        rounds = max(1, self.settings.evaluations // size - 1)
+        rounds = max(1, self.settings.evaluations // (1 if start is None else 3) // size - 1)
         done = 0
 
         def report(intermediate_result: object) -> None:
@@ -240,6 +279,7 @@ class Planner:
             self.bounds,
             maxiter=rounds,
             popsize=_POPULATION,
+            x0=start,
             rng=rng,
             tol=1e-4,
             polish=False,
@@ -259,12 +299,23 @@ class Planner:
         )
 
 
-def places(bone: Bone, worth: Array, size_mm: float = _GRID_MM) -> Worth:
-    """Marrow in places of some mm, with what cement there is worth, from a map (X, Y, Z) of the voxels."""
+def places(
+    bone: Bone, model: Model, mechanisms: Sequence[Mechanism], settings: CementSettings, size_mm: float = _GRID_MM
+) -> Worth:
+    """Marrow in places of some mm, with what cement there is worth against each mechanism."""
     grid = blocks(bone.femur, size_mm)
     room = grid.mean(bone.pores)
     index = np.argwhere(room > 0.05)
     where = tuple(index.T)
-    pores = room[where]
-    value = grid.mean(bone.pores * worth)[where] / pores
-    return Worth(grid.centres(index), pores * size_mm**3 / 1000, value)
+    room_ml = room[where] * size_mm**3 / 1000
+    rise = settings.strength_mpa * model.fill - model.material.tension
+    alone = mechanisms[0].load_n
+    base, worth = [], []
+    field = np.zeros(model.grid.shape)
+    for each in mechanisms:
+        load, more = each.bound(model.material.tension, rise)
+        field[tuple(model.mesh.cells.T)] = more / alone
+        density = grid.mean(model.grid.spread(field) * bone.marrow)[where]  # per element's volume
+        base.append(load / alone)
+        worth.append(density * (size_mm / model.mesh.size_mm) ** 3 / room_ml)
+    return Worth(grid.centres(index), room_ml, np.array(base), np.array(worth))

@@ -9,15 +9,13 @@ from numpy.typing import NDArray
 
 from femoreg_torch.planning.curve import Curve
 from femoreg_torch.planning.diffusion import diffuse
-from femoreg_torch.planning.distribution import Distribution, optimise
+from femoreg_torch.planning.distribution import Distribution, mechanism, optimise
+from femoreg_torch.planning.model import with_cement
 from femoreg_torch.planning.path import Clearances, Path, Planner, Surroundings, places
 from femoreg_torch.planning.prepare import Prepared
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
-
-_NUDGE = 0.08  # deviation of a last change, of each parameter's range
-_TRIES = 30  # of a change that keeps all limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +28,7 @@ class FemoroplastyPlan:
     clearances: Clearances
     cement: Array  # (X, Y, Z) share of the voxels' pores, after diffusion
     curve: Curve  # with that cement
-    polished: tuple[float, ...]  # yield loads of the changes that were tried, the first without change
+    polished: tuple[float, ...]  # yield loads of the paths that were tried, in order
 
     @property
     def gain(self) -> float:
@@ -46,50 +44,45 @@ class FemoroplastyPlan:
 def make_plan(
     prepared: Prepared, volume_ml: float, seed: int, progress: Progress = lambda step, share: None
 ) -> FemoroplastyPlan:
-    """Optimum, path, diffusion; then a few changes of the path, kept where the yield load rises.
+    """Optimum, path, diffusion; then paths anew, which also withstand the way in which the last one gave way.
 
+    A femur gives way in head, neck or trochanter, whichever is weakest, so cement that serves one mechanism alone gains
+    little. The search for a path takes the least load over all mechanisms that were seen so far, an upper bound of what
+    the path is worth; the whole model then tells its worth, and by which mechanism it fails. The best one counts.
     Same seed, same plan. Raises `InputError` if the volume does not fit or no path keeps its limits.
     """
-    bone, planning = prepared.bone, prepared.planning
+    bone, model, planning = prepared.bone, prepared.model, prepared.planning
     rng = np.random.default_rng(seed)
     optimum = optimise(
-        bone, prepared.model, prepared.press, volume_ml, planning, lambda share: progress("optimal cement", 0.6 * share)
+        bone, model, prepared.press, volume_ml, planning, lambda share: progress("optimal cement", 0.5 * share)
     )
     around = Surroundings(bone)
-    worth = places(bone, prepared.model.grid.spread(optimum.worth))
-    planner = Planner(around, worth, volume_ml, planning.path)
-    x = planner.search(rng, lambda share: progress("path", 0.6 + 0.2 * share))
-    path, cement, curve = _tried(prepared, planner, x)
-    loads = [curve.yield_load_n]
-    for n in range(planning.path.polish):
-        progress("last changes of the path", 0.8 + 0.2 * n / planning.path.polish)
-        changed = _nudged(planner, x, rng)
-        if changed is None:
-            break
-        other, other_cement, other_curve = _tried(prepared, planner, changed)
-        loads.append(other_curve.yield_load_n)
-        if other_curve.yield_load_n > curve.yield_load_n:
-            x, path, cement, curve = changed, other, other_cement, other_curve
+    mechanisms = list(optimum.mechanisms)
+    tried: list[tuple[Array, Path, Array, Curve]] = []
+    searches = 1 + planning.path.polish
+    for n in range(searches):
+        worth = places(bone, model, mechanisms, planning.cement)
+        planner = Planner(around, worth, volume_ml, planning.path)
+        start = max(tried, key=_load)[0] if tried else None
+        x = planner.search(rng, _within(progress, n / searches, 1 / searches), start)
+        path = planner.path(x)
+        cement = diffuse(bone, path.injections(), planning.diffusion)
+        material = with_cement(model, bone, cement, planning.cement)
+        tried.append((x, path, cement, prepared.press.curve(material, planning.curve)))
+        mechanisms.append(mechanism(tried[-1][3], material))
+    _, path, cement, curve = max(tried, key=_load)
     clearances = around.clearances(path, planning.path)
-    return FemoroplastyPlan(volume_ml, optimum, path, clearances, cement, curve, tuple(loads))
+    loads = tuple(_load(each) for each in tried)
+    return FemoroplastyPlan(volume_ml, optimum, path, clearances, cement, curve, loads)
 
 
-def _tried(prepared: Prepared, planner: Planner, x: Array) -> tuple[Path, Array, Curve]:
-    drilled = planner.drilled(x)
-    assert drilled is not None  # limits were kept
-    path = planner.filled(x, drilled)[0]
-    cement = diffuse(prepared.bone, path.injections(), prepared.planning.diffusion)
-    return path, cement, prepared.curve(cement)
+def _within(progress: Progress, begun: float, share: float) -> Callable[[float], None]:
+    """Progress of one search, as a part of the second half of all."""
+    return lambda part: progress("path", 0.5 + 0.5 * (begun + share * part))
 
 
-def _nudged(planner: Planner, x: Array, rng: np.random.Generator) -> Array | None:
-    """Parameters nearby that keep all limits, or None if they are not found."""
-    low, high = np.array(planner.bounds).T
-    for _ in range(_TRIES):
-        changed = np.clip(x + rng.normal(size=len(x)) * _NUDGE * (high - low), low, high)
-        if planner.cost(changed) < 1:
-            return np.asarray(changed)
-    return None
+def _load(tried: tuple[Array, Path, Array, Curve]) -> float:
+    return tried[3].yield_load_n
 
 
 def until_yield(prepared: Prepared) -> Prepared:

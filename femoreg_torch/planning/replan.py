@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path as File
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,11 @@ from femoreg_torch.case import read_case
 from femoreg_torch.case.model import Side
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.offsets import Outcome, carried_out
-from femoreg_torch.planning.path import Surroundings
+from femoreg_torch.planning.path import Path, Surroundings
 from femoreg_torch.planning.plan import until_yield
 from femoreg_torch.planning.prepare import prepare
 from femoreg_torch.planning.report import NOTICE, read_plan
+from femoreg_torch.planning.response import Response, fit_response, gains
 
 Array = NDArray[np.float64]
 
@@ -25,21 +26,35 @@ class Replan:
 
     def __init__(self, folder: File, case: File | None = None) -> None:
         self.stored = read_plan(folder)
-        self._prepared = until_yield(prepare(read_case(case or self.stored.case), self.stored.planning))
-        femur = self._prepared.bone.femur
+        self.prepared = until_yield(prepare(read_case(case or self.stored.case), self.stored.planning))
+        femur = self.prepared.bone.femur
         self.side: Side = femur.side
-        self._around = Surroundings(self._prepared.bone)
+        self.around = Surroundings(self.prepared.bone)
         box = tuple(slice(a, a + n) for a, n in zip(femur.corner, femur.mask.shape, strict=True))
         self._cement = self.stored.cement[box]
         if self._cement.shape != femur.mask.shape:
             raise InputError(f"{folder}: its cement lies on another grid than the CT of the case. Plan again.")
-        self.baseline_n = self._prepared.curve().yield_load_n
+        self.baseline_n = self.prepared.curve().yield_load_n
         self.planned_n = self.at(np.zeros(3)).yield_load_n
 
-    def at(self, offset: Array) -> Outcome:
-        """The plan moved by an offset (3,), LPS mm."""
-        moves = self.stored.planning.offsets.moves
-        return carried_out(self._prepared, self._around, self.stored.path, self._cement, offset, moves)
+    def at(self, move: Array) -> Outcome:
+        """The plan moved by mm (3,), LPS, or by mm and degrees (6,) about its entry point."""
+        return self._of(
+            self.stored.path, np.concatenate([move, np.zeros(6 - len(move))]), self.stored.planning.offsets.moves
+        )
+
+    def along(self, path: Path) -> Outcome:
+        """Another path carried out in its place."""
+        return self._of(path, np.zeros(6), "path")
+
+    def _of(self, path: Path, move: Array, moves: Literal["path", "pattern"]) -> Outcome:
+        return carried_out(self.prepared, self.around, path, self._cement, move, moves)
+
+    def response(self, outcomes: Mapping[str, Outcome], distance_mm: float) -> Response:
+        """How the gain answers to small errors, from the six directions and four turned ends."""
+        path = self.stored.path
+        found = gains(outcomes, self.baseline_n)
+        return fit_response(self.gain(self.planned_n), found, distance_mm, path.entry, path.target, self.side)
 
     def gain(self, load_n: float) -> float:
         """Gain over the femur without cement, %."""

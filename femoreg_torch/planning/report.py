@@ -15,6 +15,7 @@ from femoreg_torch.planning.curve import Curve
 from femoreg_torch.planning.path import Ellipsoid, Path
 from femoreg_torch.planning.plan import FemoroplastyPlan
 from femoreg_torch.planning.prepare import Prepared
+from femoreg_torch.planning.response import Response, response_content
 from femoreg_torch.planning.settings import Planning
 from femoreg_torch.settings import read_record
 from femoreg_torch.volume import read_label_map, write_volume
@@ -100,6 +101,12 @@ class StoredPlan:
     baseline_n: float
     planned_n: float
     cement: Array  # (X, Y, Z) 0 or 1, of the whole CT
+
+
+def add_response(folder: File, response: Response) -> None:
+    """Keep in a plan how its gain answers to small errors, in place of what it held of that."""
+    content = read_json(folder / PLAN_NAME)
+    write_json(folder / PLAN_NAME, content | {"response": response_content(response)})
 
 
 def read_plan(folder: File) -> StoredPlan:

@@ -79,6 +79,21 @@ class PoseCovariance:
         response[:, j : j + 3] += skew(arm) * torch.pi / 180  # − ω × arm
         return (response @ self.matrix @ response.T).diagonal().clamp(min=0).sqrt().tolist()
 
+    def beside(self, name: str, other: str, point: Tensor, images_only: bool) -> Tensor:
+        """Covariance (6, 6) of one object's motion seen from another, at a point (3,) mm in camera 1.
+
+        Of its translation there in mm, then of its rotation in degrees, along the axes of camera 1. What moves both
+        together does not count. `images_only`: as if the intrinsics were certain.
+        """
+        matrix = self.images if images_only else self.matrix
+        response = matrix.new_zeros(6, len(matrix))
+        for body, sign in ((name, 1.0), (other, -1.0)):
+            i = 6 * self.bodies.index(body)
+            response[:3, i + 3 : i + 6] += sign * torch.eye(3)
+            response[:3, i : i + 3] -= sign * skew(point - self.centres[i // 6]) * torch.pi / 180  # ω × arm
+            response[3:, i : i + 3] += sign * torch.eye(3)
+        return response @ matrix @ response.T
+
     def pull(self, name: str) -> tuple[float, float]:
         """Degrees and mm that all images together would move one body by, were all bodies free."""
         i = 6 * self.bodies.index(name)

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from femoreg_torch.case import Case
 from femoreg_torch.case.quality import CameraQuality, ObjectQuality, ViewQuality
 from femoreg_torch.case.trace import StageRecord
-from femoreg_torch.geometry import CArm, Poses, pose_difference
+from femoreg_torch.geometry import CArm, Poses, pose_difference, transform_points
 from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
@@ -97,6 +98,24 @@ def carm_in_question(scene: Scene, poses: Poses, covariance: PoseCovariance, lim
     """
     believed = float(covariance.intrinsics.mean.abs().max()) <= limits.most_intrinsics_sigma
     return scene.carm.uncertainty is not None or bool(poses.changes) or not believed
+
+
+def path_covariance(
+    case: Case, scene: Scene, poses: Poses, covariance: PoseCovariance, limits: Limits
+) -> Tensor | None:
+    """How uncertain the tool's place is in the object with the planned path, see `Result.path_covariance`.
+
+    None without a planned path, where its tool was not registered, or where the images leave it open.
+    """
+    plan = case.plan
+    if plan is None or plan.tool is None or not {plan.object, plan.tool} <= set(poses.camera1_from):
+        return None
+    pose = poses.camera1_from[plan.object]
+    entry = transform_points(pose, plan.entry_point[None])[0]
+    images_only = not carm_in_question(scene, poses, covariance, limits)
+    turn = torch.block_diag(pose[:3, :3].T, pose[:3, :3].T)
+    found = turn @ covariance.beside(plan.tool, plan.object, entry, images_only) @ turn.T
+    return found if torch.isfinite(found).all() else None
 
 
 def shift_px(carm: CArm, deviations: Tensor) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from femoreg_torch.geometry import check_rigid
 from femoreg_torch.registration.doubts import doubts
 from femoreg_torch.registration.plan import Plan, load_plan
 from femoreg_torch.registration.prepare import prepare_scene
-from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance
+from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance, path_covariance
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.registration.start import (
     Detector,
@@ -151,6 +151,7 @@ def register_scene(
         path=None if case.plan is None else (case.plan.object, case.plan.tool),
         points_camera1=points,
         directions_camera1=directions,
+        path_covariance=path_covariance(case, scene, outcome.poses, covariance, Limits()),
         timings_s={
             "reading": clock["prepared"] - clock["began"],
             "detection": clock["started"] - clock["prepared"],

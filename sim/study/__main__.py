@@ -1,4 +1,4 @@
-"""`python -m sim.study COMMAND …`: the measurements behind `docs/accuracy.md`; see the Makefile."""
+"""`python -m sim.study COMMAND …`: measures what `docs/accuracy.md` and `docs/planning.md` tell; see the Makefile."""
 
 import os
 import sys
@@ -16,6 +16,7 @@ from femoreg_torch.registration import load_plan
 from femoreg_torch.statistics.study import read_study
 from sim.study import ablation as variants
 from sim.study import capture
+from sim.study import plans as planning
 from sim.study.accuracy_page import write_results
 from sim.study.cadaver import cadaver
 from sim.study.cases import Stores
@@ -23,6 +24,7 @@ from sim.study.conditions import Imaged, is_made, make_conditions
 from sim.study.conditions_page import write_conditions
 from sim.study.executors import OnThisMachine
 from sim.study.limits import limits as limits_of
+from sim.study.plans_page import write_plans
 from sim.study.procedures import Procedure
 from sim.study.protocol import Protocol, load_protocol
 from sim.study.store import Run
@@ -34,6 +36,7 @@ from sim.study.yardsticks import only_these, plan_yardstick, take_earlier
 
 _DATA = Path(os.environ.get("FEMOREG_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 _OUT = Path("out/accuracy")
+_PAPER_RUNS = Path(__file__).resolve().parents[2] / "docs" / "results" / "paper"
 Kind = Literal["all", "procedural", "real"]
 
 
@@ -278,6 +281,36 @@ def limits(
     return DONE
 
 
+def plans(
+    first: int | None = None,
+    meshes: bool = True,
+    out: Path = Path("out/plans"),
+    data: Path = _DATA,
+    docs: Path | None = None,
+) -> int:
+    """Plan cement for three femora, move the plans, compare meshes; goes on where it was stopped.
+
+    Args:
+        first: only the first so many femora.
+        meshes: compare meshes on the first femur.
+        out: folder of cases and plans, and of what was measured so far.
+        data: folder with the real CTs in ct/; the environment's FEMOREG_DATA, if set.
+        docs: folder of the page that is to be renewed, with all that was measured so far.
+    """
+    for number, subject in enumerate(planning.SUBJECTS[:first]):
+        print(subject.title, flush=True)
+        planning.measure(subject, out, data)
+        planning.compare_laws(subject, out)
+        if number == 0:
+            planning.draw_errors(subject, out, _PAPER_RUNS)
+        if meshes and number == 0:
+            planning.compare_meshes(subject, out)
+    if docs is not None:
+        found = [known for subject in planning.SUBJECTS if (known := planning.measured(subject, out)) is not None]
+        print(write_plans(found, "make plans", docs))
+    return DONE
+
+
 def listing(first: int | None = None, kind: Kind = "all", out: Path = _OUT) -> int:
     """Which procedures the study has, and which of their cases are there.
 
@@ -359,6 +392,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "conditions": conditions,
         "limits": limits,
         "cadaver": cadaver,
+        "plans": plans,
         "list": listing,
     }
     try:

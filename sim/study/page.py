@@ -1,4 +1,4 @@
-"""The page `docs/accuracy.md`: sections of Markdown, each replaced as a whole when it is measured anew."""
+"""The page `docs/accuracy.md`, and others: sections of Markdown, each replaced as a whole when it is measured anew."""
 
 import os
 import platform
@@ -16,9 +16,9 @@ nothing about patients. The paper's figures beside them are means over 1,000 sim
 simulator (Gao et al., IEEE Trans Med Robot Bionics 2 (2020) 437, Tables I and II)."""
 
 
-def write_section(docs: Path, title: str, text: str) -> None:
-    """Put a section into the page in the folder `docs`, in place of an older one of the same title."""
-    path = docs / PAGE
+def write_section(docs: Path, title: str, text: str, page: str = PAGE) -> None:
+    """Put a section into a page in the folder `docs`, in place of an older one of the same title."""
+    path = docs / page
     before = path.read_text(encoding="utf-8").rstrip() if path.is_file() else _HEAD
     head, *sections = before.split("\n## ")
     kept = {section.split("\n", 1)[0]: section.rstrip() for section in sections}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from femoreg_torch.planning.calibration import Calibration
-from femoreg_torch.planning.convergence import on_meshes
+from femoreg_torch.planning.convergence import MeshRow, on_mesh
 from femoreg_torch.planning.curve import Press
 from femoreg_torch.planning.femur import Femur
 from femoreg_torch.planning.figures import mesh_figure
@@ -40,13 +40,14 @@ def test_the_first_row_is_the_model_itself(
     quick = dataclasses.replace(planning, curve=dataclasses.replace(planning.curve, step_mm=0.5))
     prepared = prepared_femur(solids[0], femur, quick, 8.0)
     cement = in_the_neck(prepared)
-    ((size, load, gain),) = on_meshes(prepared, cement, [8.0])
-    assert size == 8.0
-    assert load == prepared.curve().yield_load_n
-    assert gain == pytest.approx(prepared.curve(cement).yield_load_n / load - 1)
-    assert gain > 0
-    figure = mesh_figure([(size, load, gain), (6.0, load, gain)])
-    assert [axis.get_xlabel() for axis in figure.axes] == ["elements, mm"] * 2
+    row = on_mesh(prepared, cement, 8.0)
+    assert row.size_mm == 8.0
+    assert row.elements == len(prepared.model.mesh.elements)
+    assert row.baseline_n == prepared.curve().yield_load_n
+    assert row.gain == pytest.approx(prepared.curve(cement).yield_load_n / row.baseline_n - 1)
+    assert row.gain > 0
+    figure = mesh_figure([row, MeshRow(6.0, 2 * row.elements, row.baseline_n, row.gain, 3 * row.seconds)])
+    assert [axis.get_xlabel() for axis in figure.axes] == ["elements, mm", "elements, mm", "elements"]
 
 
 @pytest.mark.long
@@ -54,8 +55,8 @@ def test_three_millimetres_agree_with_finer_meshes(
     solids: tuple[Volume, Volume, np.ndarray], femur: Femur, planning: Planning
 ) -> None:
     prepared = prepared_femur(solids[0], femur, planning, 3.0)
-    rows = on_meshes(prepared, in_the_neck(prepared), [3.0, 2.0, 1.5])
-    _, finest_load, finest_gain = rows[-1]
-    for _, load, gain in rows:
-        assert load == pytest.approx(finest_load, rel=0.05)
-        assert gain == pytest.approx(finest_gain, abs=0.03)
+    cement = in_the_neck(prepared)
+    rows = [on_mesh(prepared, cement, size) for size in (3.0, 2.0, 1.5)]
+    for row in rows:
+        assert row.baseline_n == pytest.approx(rows[-1].baseline_n, rel=0.05)
+        assert row.gain == pytest.approx(rows[-1].gain, abs=0.03)

@@ -13,17 +13,22 @@ import trimesh
 from pyarrow import parquet, table
 from scipy import ndimage
 
-from femoreg_torch.case import Case, read_case
+from femoreg_torch.case import Case, ObjectQuality, Result, read_case, write_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
+from femoreg_torch.evaluation.planning_section import planning_section
 from femoreg_torch.files import write_json
-from femoreg_torch.planning.offsets import carried_out, directions, normal_offsets, study_offsets
-from femoreg_torch.planning.path import Ellipsoid, Path, Planner, Surroundings, Worth, covered, places
+from femoreg_torch.geometry import Poses
+from femoreg_torch.planning.distribution import mechanism
+from femoreg_torch.planning.model import with_cement
+from femoreg_torch.planning.offsets import carried_out, directions, turned_ends
+from femoreg_torch.planning.path import Ellipsoid, Path, Planner, Surroundings, Worth, central_path, covered, places
 from femoreg_torch.planning.plan import FemoroplastyPlan, make_plan
 from femoreg_torch.planning.prepare import Prepared, prepare
 from femoreg_torch.planning.report import read_plan, write_plan
+from femoreg_torch.planning.response import Response, read_response, response_content
 from femoreg_torch.planning.settings import Planning, load_planning
-from femoreg_torch.volume import Volume, read_label_map, write_landmarks, write_volume
+from femoreg_torch.volume import Volume, read_ct, read_label_map, write_landmarks, write_volume
 
 PRESET = """extends: default
 calibration: {kind: uncalibrated}
@@ -34,6 +39,7 @@ diffusion: {voxel_mm: 3}
 offsets: {distance_mm: 4}
 """
 ML = 6.0
+ENDS = {"end superior", "end inferior", "end anterior", "end posterior"}
 SIX = {"superior", "inferior", "anterior", "posterior", "medial", "lateral"}
 
 
@@ -122,7 +128,7 @@ def test_the_path_keeps_its_limits(prepared: Prepared, plan: FemoroplastyPlan) -
 
 
 def planner(prepared: Prepared, plan: FemoroplastyPlan, **limits: Any) -> Planner:
-    worth = places(prepared.bone, prepared.model.grid.spread(plan.optimum.worth))
+    worth = places(prepared.bone, prepared.model, plan.optimum.mechanisms, prepared.planning.cement)
     return Planner(Surroundings(prepared.bone), worth, ML, dataclasses.replace(prepared.planning.path, **limits))
 
 
@@ -133,9 +139,33 @@ def test_same_seed_same_plan(prepared: Prepared, plan: FemoroplastyPlan) -> None
     assert prepared.curve(plan.cement).yield_load_n == plan.curve.yield_load_n
 
 
+def test_a_mechanism_bounds_what_cement_can_bear(prepared: Prepared, plan: FemoroplastyPlan) -> None:
+    """Of its own state a mechanism tells the load that it had; of all others it is told that none bears much more."""
+    model, bone, cement = prepared.model, prepared.bone, prepared.planning.cement
+    rise = cement.strength_mpa * model.fill - model.material.tension
+    placed = [np.zeros(bone.pores.shape), plan.optimum.cement, plan.cement]
+    with_it = [with_cement(model, bone, share, cement) for share in placed]
+    curves = [prepared.press.curve(material, prepared.planning.curve) for material in with_it]
+    loads = [curve.yield_load_n for curve in curves]
+    ways = [mechanism(curve, material) for curve, material in zip(curves, with_it, strict=True)]
+    for own, way in enumerate(ways):
+        alone, more = way.bound(model.material.tension, rise)
+        bounds = [alone + float(more @ model.cement_share(share)) for share in placed]
+        assert bounds[own] == pytest.approx(loads[own], rel=0.02)  # voxels mix before they are averaged
+        for bound, load in zip(bounds, loads, strict=True):
+            assert bound > 0.8 * load  # yield comes before the limit load, so it is a bound only about
+    worth = places(bone, model, ways, cement)
+    assert worth.load(np.zeros(len(worth.room_ml))) == pytest.approx(min(worth.base))
+    assert worth.base[0] == pytest.approx(1.0)
+    everywhere = worth.base[0] + worth.worth[0] @ worth.room_ml  # all of the marrow
+    alone, more = ways[0].bound(model.material.tension, rise)
+    filled = alone + float(more @ model.cement_share(bone.marrow.astype(float)))
+    assert everywhere == pytest.approx(filled / loads[0], rel=0.05)
+
+
 def test_an_ellipsoid_of_some_volume_has_its_axes() -> None:
     points = np.argwhere(np.ones((60, 60, 60))) * 0.5 - 14.75
-    worth = Worth(points, np.full(len(points), 0.5**3 / 1000), np.ones(len(points)))
+    worth = Worth(points, np.full(len(points), 0.5**3 / 1000), np.ones(1), np.ones((1, len(points))))
     axes = np.array([[2.0, 1.0]])
     filled, _, scale = covered(np.array([0, 0, 1.0]), np.zeros((1, 3)), axes, worth, 2.0)
     assert scale == pytest.approx((2000 / (4 / 3 * np.pi * 2)) ** (1 / 3), rel=0.01)
@@ -154,38 +184,12 @@ def test_offsets_move_along_the_patient_and_not_moved_is_as_planned(prepared: Pr
     np.testing.assert_array_equal(directions("left")["medial"], -directions("right")["medial"])
     around = Surroundings(prepared.bone)
     for moves in ("path", "pattern"):
-        still = carried_out(prepared, around, plan.path, plan.cement, np.zeros(3), moves)  # type: ignore[arg-type]
+        still = carried_out(prepared, around, plan.path, plan.cement, np.zeros(6), moves)  # type: ignore[arg-type]
         assert still.yield_load_n == pytest.approx(plan.curve.yield_load_n, rel=1e-9)
     assert still.clearance_mm == pytest.approx(plan.clearances.cortex_mm)
-    away = np.array([0.0, 80.0, 0.0])
+    away = np.array([0.0, 80.0, 0.0, 0.0, 0.0, 0.0])
     with pytest.raises(InputError, match="the path leaves the bone"):
         carried_out(prepared, around, plan.path, plan.cement, away, "path")
-
-
-def test_random_offsets_have_their_mean_and_covariance(tmp_path: File) -> None:
-    covariance = np.array([[1.0, 0.3, 0], [0.3, 2, 0], [0, 0, 0.5]])
-    drawn = normal_offsets(np.array([1.0, -2, 0]), covariance, 20000, 0)
-    np.testing.assert_allclose(drawn.mean(0), [1, -2, 0], atol=0.05)
-    np.testing.assert_allclose(np.cov(drawn.T), covariance, atol=0.06)
-    with pytest.raises(InputError, match="symmetric 3 × 3"):
-        normal_offsets(np.zeros(3), -np.eye(3), 5, 0)
-
-
-@pytest.mark.parametrize("suffix", ["parquet", "csv"])
-def test_offsets_of_a_study_are_those_of_its_trusted_runs(tmp_path: File, suffix: str) -> None:
-    columns: dict[str, Any] = {
-        f"femur_mm_{axis}": [n, 9.0, n] for axis, n in zip(("lr", "ap", "is"), (1.0, 2.0, 3.0), strict=True)
-    }
-    columns |= {f"device_mm_{axis}": [0.5, 9.0, 0.5] for axis in ("lr", "ap", "is")}
-    columns["trusted"] = [True, False, True]
-    if suffix == "parquet":
-        parquet.write_table(table(columns), tmp_path / "runs.parquet")
-    else:
-        lines = [",".join(columns), *(",".join(str(values[n]) for values in columns.values()) for n in range(3))]
-        (tmp_path / "runs.csv").write_text("\n".join(lines) + "\n")
-    np.testing.assert_allclose(study_offsets(tmp_path, 50, 0), np.tile([0.5, 1.5, 2.5], (50, 1)))
-    with pytest.raises(InputError, match="neither"):
-        study_offsets(tmp_path / "elsewhere", 1, 0)
 
 
 def test_files_tell_the_plan(written: File, folder: File, prepared: Prepared, plan: FemoroplastyPlan) -> None:
@@ -206,10 +210,11 @@ def test_files_tell_the_plan(written: File, folder: File, prepared: Prepared, pl
     labels = read_label_map(written / "cement.nii.gz")
     assert labels.data.shape == prepared.ct.data.shape
     assert int(labels.data.sum()) == int((plan.cement >= 0.5).sum())
-    middle = np.argwhere(labels.data.numpy().transpose(2, 1, 0)).mean(0) @ prepared.ct.lps_from_index.numpy()[:3, :3].T
+    voxels = np.argwhere(labels.data.numpy().transpose(2, 1, 0))
+    middle = (voxels.min(0) + voxels.max(0)) / 2 @ prepared.ct.lps_from_index.numpy()[:3, :3].T
     middle += prepared.ct.lps_from_index.numpy()[:3, 3]
     surface = trimesh.load(written / "cement.stl")
-    np.testing.assert_allclose(surface.bounds.mean(0), middle, atol=6)  # type: ignore[union-attr]
+    np.testing.assert_allclose(surface.bounds.mean(0), middle, atol=1e-6)  # type: ignore[union-attr]
     assert surface.volume / 1000 == pytest.approx(  # type: ignore[union-attr]
         int(labels.data.sum()) * prepared.bone.femur.voxel_ml, rel=0.25
     )
@@ -233,17 +238,113 @@ def test_commands_end_to_end(folder: File, capsys: pytest.CaptureFixture[str]) -
     assert {"plan.json", "curves.png", "overlay.png", "fields.vtu", "cement.stl"} <= {p.name for p in out.iterdir()}
     assert main(["plan-offsets", str(out)]) == 0
     offsets = json.loads((out / "offsets.json").read_text())
-    assert set(offsets["outcomes"]) == SIX
+    assert set(offsets["outcomes"]) == SIX | ENDS
     planned = json.loads((out / "plan.json").read_text())["planned"]["yield_load_n"]
+    response = read_response(out / "plan.json")
+    assert response is not None
+    medial = np.array([-response.distance_mm, 0, 0, 0, 0])  # of a left femur; the quadratic goes through what was run
+    quadratic = response.gain_percent + response.slope @ medial + response.curvature @ medial**2 / 2
+    assert quadratic == pytest.approx(offsets["outcomes"]["medial"][0]["gain_percent"])
     assert offsets["planned_n"] == pytest.approx(planned, rel=1e-6)
     study = folder / "study"
     study.mkdir()
     columns = {f"{name}_mm_{axis}": [0.4, -0.7] for name in ("femur", "device") for axis in ("lr", "ap", "is")}
     parquet.write_table(table(columns), study / "runs.parquet")
-    assert main(["plan-robustness", str(out), "--study", str(study), "--draws", "2"]) == 0
+    assert main(["plan-robustness", str(out), "--study", str(study), "--draws", "1"]) == 0
     found = json.loads((out / "robustness.json").read_text())  # both err alike: the path is where it was planned
     assert found["gain_percent_median"] == pytest.approx(found["planned_gain_percent"])
+    (folder / "sure.csv").write_text("0,0,0\n0,0,0\n0,0,0\n")
+    shift = ["--covariance", str(folder / "sure.csv"), "--mean", f"[{-response.distance_mm}, 0, 0]", "--draws", "1"]
+    assert main(["plan-robustness", str(out), *shift]) == 0
+    found = json.loads((out / "robustness.json").read_text())
+    assert found["gain_percent_median"] == pytest.approx(offsets["outcomes"]["medial"][0]["gain_percent"])
     capsys.readouterr()
+    for words, told in (
+        ([], "either --study or --covariance"),
+        (["--covariance", str(folder / "no.csv")], "there is no such file"),
+        (["--covariance", str(folder / "sure.csv"), "--mean", "[1, 2]"], "mean: 3 numbers"),
+    ):
+        assert main(["plan-robustness", str(out), *words]) == 2
+        line = capsys.readouterr().err
+        assert told in line
+        assert line.count("\n") == 1
+
+
+def test_a_turned_path_keeps_its_entry_and_is_run_anew(prepared: Prepared, plan: FemoroplastyPlan) -> None:
+    around = Surroundings(prepared.bone)
+    move = turned_ends(plan.path, 3.0)["end superior"]
+    found = {
+        moves: carried_out(prepared, around, plan.path, plan.cement, move, moves)  # type: ignore[arg-type]
+        for moves in ("path", "pattern")
+    }
+    for outcome in found.values():
+        assert outcome.offset_mm == (0.0, 0.0, 0.0)
+        assert np.linalg.norm(outcome.turn_deg) == pytest.approx(np.degrees(3.0 / plan.path.length_mm))
+        assert outcome.yield_load_n != plan.curve.yield_load_n
+    assert found["path"].cement_ml == pytest.approx(ML)
+
+
+def test_the_path_of_a_plan_is_read_by_a_case(written: File, folder: File, plan: FemoroplastyPlan) -> None:
+    text = (folder / "case.yaml").read_text()
+    other = folder / "by_file"
+    other.mkdir()
+    for name in ("ct.nii.gz", "labels.nii.gz", "landmarks.json"):
+        (other / name).symlink_to(folder / name)
+    by_file = text.replace("{entry_point: [86, 5, 100], target: FH}", "{file: ../plan/plan.json}")
+    (other / "case.yaml").write_text(by_file)
+    case = read_case(other)
+    assert case.plan is not None
+    np.testing.assert_allclose(case.plan.entry_point, plan.path.entry, atol=1e-9)
+    assert case.plan.file == other / "../plan/plan.json"
+    (folder / "again").mkdir()
+    write_case(folder / "again", case)
+    again = read_case(folder / "again").plan
+    assert again is not None
+    assert again.file is not None
+    assert again.file.resolve() == (written / "plan.json").resolve()
+    for changed, told in (
+        (by_file.replace("plan.json}", "plan.json, target: FH}"), "stands in the `file` of the plan already"),
+        (by_file.replace("side: left", "side: right"), "is a plan for the left femur"),
+    ):
+        (other / "case.yaml").write_text(changed)
+        write_landmarks(folder / "again" / "landmarks.json", {"FH-l": plan_head(), "FH-r": plan_head()})
+        (other / "landmarks.json").unlink(missing_ok=True)
+        (other / "landmarks.json").symlink_to(folder / "again" / "landmarks.json")
+        with pytest.raises(InputError, match=told):
+            read_case(other)
+
+
+def test_the_report_tells_the_plan(written: File, folder: File, plan: FemoroplastyPlan) -> None:
+    case = read_case(folder)
+    assert case.plan is not None
+    good = ObjectQuality((), 0.0, (0.0, 0.0), (0.1,) * 3, (0.1,) * 3, None, True, "all views agree")
+    pose = torch.eye(4, dtype=torch.float64)
+    covariance = torch.diag(torch.tensor([0.04, 0.04, 0.04, 0.01, 0.01, 0.01], dtype=torch.float64))
+    result = Result(Poses(pose[None], {"femur": pose}), {"femur": good}, path_covariance=covariance)
+    assert planning_section(case, result) == ""  # its path is no plan's
+    file = folder / "with_response.json"
+    content = json.loads((written / "plan.json").read_text())
+    sloped = Response(100 * plan.gain, np.array([5.0, 0, 0, 0, 0]), np.zeros(5), 4.0, plan.path.entry, plan.path.target)
+    write_json(file, content | {"response": response_content(sloped)})
+    page = planning_section(dataclasses.replace(case, plan=dataclasses.replace(case.plan, file=file)), result)
+    assert "the modelled gain is" in page
+    assert "± 1.0 %" in page  # 5 % per mm, 0.2 mm
+    assert f"<td>{plan.curve.yield_load_n:.0f}</td>" in page
+    assert page.count("<tr>") == 2 + 3 + len(plan.path.ellipsoids)
+    assert "research software" in page.lower()
+
+
+def plan_head() -> torch.Tensor:
+    return torch.tensor([20.0, 0.0, 130.0], dtype=torch.float64)
+
+
+def test_the_central_line_runs_along_the_neck_to_the_head(prepared: Prepared) -> None:
+    around = Surroundings(prepared.bone)
+    line = central_path(around, ML, prepared.planning.path)
+    np.testing.assert_allclose(line.target, prepared.bone.femur.frame.head)
+    np.testing.assert_allclose(-line.direction, around.neck, atol=1e-9)
+    assert sum(e.volume_ml for e in line.ellipsoids) == pytest.approx(ML)
+    assert [e.depth_mm / line.length_mm for e in line.ellipsoids] == pytest.approx([0.75, 0.5, 0.25])
 
 
 def test_commands_tell_bad_input_in_one_line(folder: File, capsys: pytest.CaptureFixture[str]) -> None:
@@ -257,6 +358,54 @@ def test_commands_tell_bad_input_in_one_line(folder: File, capsys: pytest.Captur
     write_json(folder / "wrong" / "plan.json", {"version": 1})
     assert main(["plan-offsets", str(folder / "wrong")]) == 2
     assert "is no plan of `femoreg plan`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("cut", "the left femur is cut off by the CT at the top"),
+        ("pieces", "the left femur has 2 pieces"),
+        ("hollow", "the left femur has holes of"),
+        ("no air", "calibration: the CT has no peak of air"),
+    ],
+)
+def test_a_case_that_cannot_be_planned_is_told_in_one_line(
+    folder: File, tmp_path: File, capsys: pytest.CaptureFixture[str], change: str, told: str
+) -> None:
+    ct, labels = read_ct(folder / "ct.nii.gz"), read_label_map(folder / "labels.nii.gz")
+    hu, data = ct.data.clone(), labels.data.clone()
+    if change == "cut":
+        hu, data = hu[:66], data[:66]
+    elif change == "pieces":
+        data[2:20, 2:8, 2:8] = 5
+    elif change == "hollow":
+        data[40:60, 17:23, 39:45] = 0
+    else:
+        hu = hu.clamp(min=-95)  # a CT cropped to the patient
+    for file in ("case.yaml", "landmarks.json"):
+        (tmp_path / file).symlink_to(folder / file)
+    write_volume(tmp_path / "ct.nii.gz", Volume(hu, ct.lps_from_index))
+    write_volume(tmp_path / "labels.nii.gz", Volume(data, labels.lps_from_index))
+    preset = [] if change == "no air" else ["--preset", str(folder / "preset.yaml")]
+    assert main(["plan", str(tmp_path), "--out", str(tmp_path / "out"), *preset]) == 2
+    line = capsys.readouterr().err
+    assert told in line
+    assert line.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_path_that_leaves_the_bone_is_told_in_one_line(
+    written: File, tmp_path: File, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = json.loads((written / "plan.json").read_text())
+    for point in content["plan"].values():
+        point[1] += 60.0
+    (tmp_path / "cement.nii.gz").symlink_to(written / "cement.nii.gz")
+    write_json(tmp_path / "plan.json", content)
+    assert main(["plan-offsets", str(tmp_path)]) == 2
+    line = capsys.readouterr().err
+    assert "the path leaves the bone" in line
+    assert line.count("\n") == 1
 
 
 def test_a_case_without_a_head_is_refused(folder: File, settings: Planning) -> None:

@@ -127,6 +127,22 @@ def test_a_bad_label_is_told_in_one_line(solids: Solids, change: str, message: s
     assert "\n" not in str(caught.value)
 
 
+def test_a_shaft_that_the_ct_cuts_askew_is_refused(solids: Solids) -> None:
+    """A shaft leaning to the front: along it, the CT's end lies 107 mm below the head in front, 99 mm at the back."""
+    ct, labels, head = solids
+    data = labels.data.clone()
+    depth = 15  # 30 mm above the end of the CT is 100 mm below the head's centre
+    sheared = data[depth:].clone()
+    for z in range(len(sheared)):
+        sheared[z] = sheared[z].roll(-round(0.3 * max(0, 40 - z)), dims=0)  # rows are y
+    lps = labels.lps_from_index.clone()
+    lps[2, 3] += 2.0 * depth
+    bent = Volume(sheared, lps)
+    with pytest.raises(InputError, match="its last slice cuts the left femur askew") as caught:
+        cut_out(Volume(ct.data[depth:], lps), bent, 1, head, "left", 102.0)
+    assert "\n" not in str(caught.value)
+
+
 def test_a_head_outside_the_label_is_refused(solids: Solids) -> None:
     with pytest.raises(InputError, match="does not lie in the label"):
         cut_out(solids[0], solids[1], 1, HEAD_OUTSIDE, "left", 95.0)
