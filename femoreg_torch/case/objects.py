@@ -118,13 +118,13 @@ def read_plan(plan: Fields, objects: Mapping[str, CaseObject], landmarks: Mappin
         end = known[target]
     else:
         end = plan.point("target")
-    return checked_path(PlannedPath(name, plan.point("entry_point"), end, tool), plan)
+    return checked_path(PlannedPath(name, plan.point("entry_point"), end, tool), f"{plan.file}, {plan.path}")
 
 
-def checked_path(path: PlannedPath, plan: Fields) -> PlannedPath:
-    """The path, if it has a direction. Raises `InputError`."""
+def checked_path(path: PlannedPath, where: str) -> PlannedPath:
+    """The path, if it has a direction. Raises `InputError` that starts with `where` the plan stands."""
     if not (path.target - path.entry_point).norm() > 1e-6:
-        raise InputError(f"{plan.where('entry_point')}: is the target itself, so the path has no direction.")
+        raise InputError(f"{where}.entry_point: is the target itself, so the path has no direction.")
     return path
 
 

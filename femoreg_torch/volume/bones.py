@@ -28,6 +28,7 @@ class BoneLabels:
     labels: Volume  # uint8, 0 where there is no bone
     ids: dict[str, int]  # of every bone that occurs in it, or of a group of bones that it does not tell apart
     absent: LabelTable = field(default_factory=dict)  # what the user's table names, and no voxel carries
+    notes: tuple[str, ...] = ()  # what had to be done to CT and label map, in words
 
     def of(self, bones: Sequence[str], anatomy: Anatomy | None) -> tuple[int, ...]:
         """Ids of bones and groups. Raises `InputError` for a bone that the map does not tell."""
@@ -162,7 +163,7 @@ def _told_apart(
     without = []
     for bone in anatomy.members(group):
         marks = [landmarks[mark] for mark in anatomy.landmarks_of(bone) if mark in landmarks]
-        votes = Counter(label for point in marks if (label := _nearest_label(labels, ids, point)) is not None)
+        votes = Counter(label for point in marks if (label := nearest_label(labels, ids, point)) is not None)
         if not votes:
             without.append(bone)
             continue
@@ -178,7 +179,7 @@ def _told_apart(
     return told | {bone: tuple(left) for bone in without if left}
 
 
-def _nearest_label(labels: Volume, ids: Sequence[int], point: Tensor) -> int | None:
+def nearest_label(labels: Volume, ids: Sequence[int], point: Tensor) -> int | None:
     """The label among `ids` of the voxel closest to a point (3,), or None if none of them is near."""
     index = transform_points(torch.linalg.inv(labels.lps_from_index), point[None].double())[0].round().int()
     low = (index - _NEAR_VOXELS).clamp_min(0).tolist()
