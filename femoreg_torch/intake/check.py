@@ -50,7 +50,10 @@ from femoreg_torch.volume import (
 from femoreg_torch.volume.bones import nearest_label
 
 _T = TypeVar("_T")
+_ANY_PATH = PlannedPath(FEMUR, torch.zeros(3).double(), torch.ones(3).double())
+_ANY_POINTS = {name: n * torch.ones(3).double() for n, name in enumerate(DEVICE_POINTS)}
 _FAR_MM = 150.0  # from the middle of a device, beyond its own size, no point of it lies
+_FAR_FROM_BONE_MM = 400.0  # a device that starts farther from the entry point is likely told wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,9 +219,8 @@ def _check_landmarks(seen: _Anatomy, found: _Found) -> None:
                 outside.add(name)
     if seen.bones is not None:
         inside = {name: point for name, point in seen.landmarks.items() if name not in outside}
-        for told in swapped_sides(seen.bones, inside, seen.anatomy):
-            found.problem(f"{told}.")
-        for told in stray_landmarks(seen.bones, inside, seen.anatomy):
+        swapped = swapped_sides(seen.bones, inside, seen.anatomy)
+        for told in swapped or stray_landmarks(seen.bones, inside, seen.anatomy):
             found.problem(f"{told}.")
 
 
@@ -230,11 +232,14 @@ def _check_path(path: PlannedPath, side: Side, seen: _Anatomy, found: _Found) ->
     head = seen.landmarks[femoral_head(side)]
     if (path.entry_point - head).norm() < (path.target - head).norm():
         found.problem("plan: the entry point lies nearer to the femoral head than the target. Exchange the two.")
-    if seen.bones is None:
-        return
+    if seen.bones is None or operated_femur(side) not in seen.bones.ids:
+        return  # which is told
     femora = {seen.bones.ids[name]: name for name in ("femur_left", "femur_right") if name in seen.bones.ids}
-    for name, point in (("entry point", path.entry_point), ("target", path.target)):
-        label = nearest_label(seen.bones.labels, list(femora), point) if femora else None
+    ends = {"entry point": path.entry_point, "target": path.target}
+    for name, point in ends.items():
+        if torch.equal(point, head):
+            continue  # a landmark, which is looked at by itself
+        label = nearest_label(seen.bones.labels, list(femora), point)
         where = ", ".join(f"{v:.1f}" for v in point.tolist())
         if label is None:
             found.problem(
@@ -263,21 +268,18 @@ def _check_device(top: Fields, folder: Path, path: PlannedPath | None, side: Sid
                     f"{device.where('points')}.{name}: lies {away:.0f} mm from the middle "
                     "of the device. Points are mm in the space of its model; check units and RAS/LPS."
                 )
-    if path is None or side is None or set(points) != set(DEVICE_POINTS):
-        # what depends on other faults is asked when they are mended, but for a matrix
-        in_camera, beside, _ = femoroplasty_form.DEVICE_STARTS
-        if in_camera in device:
-            found.attempt(lambda: device.transform(in_camera))
-        elif beside in device:
-            found.attempt(lambda: device.transform_or_file(beside, folder))
+    known = path is not None and side is not None and set(points) == set(DEVICE_POINTS)
+    # what a pose in words depends on may be at fault itself: with anything in its place the words are still looked at
+    on, along, of = (path, side, points) if known else (_ANY_PATH, "left", _ANY_POINTS)
+    start = found.attempt(lambda: femoroplasty_form.read_device_start(device, folder, on, along, of))  # type: ignore[arg-type]
+    if not known or path is None:
         return
-    start = found.attempt(lambda: femoroplasty_form.read_device_start(device, folder, path, side, points))
     if start is not None and start.beside == FEMUR and start.camera1_from is None:
         femur_from_device = start.beside_from_object
         tip = femur_from_device[:3, :3] @ points["tip"] + femur_from_device[:3, 3]
         away = float((tip - path.entry_point).norm())
         found.facts.append(f"device: its tip starts {away:.0f} mm from the entry point")
-        if away > _FAR_MM:
+        if away > _FAR_FROM_BONE_MM:
             found.warnings.append(f"device: its tip would start {away:.0f} mm from the entry point")
 
 

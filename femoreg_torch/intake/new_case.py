@@ -287,9 +287,14 @@ def _views(
         if device_images:
             view[DEVICE] = _copied(device_images[number - 1], folder, f"view{number}_device")
         views.append(view | {"intensity": intensity})
-    beside = [f" and {path.name} with the device" for path in device_images] or [""] * len(images)
-    notes += [f"view {n} is {path.name}{more}" for n, (path, more) in enumerate(zip(images, beside, strict=True), 1)]
+    beside = [f", with the device {_short(path)}" for path in device_images] or [""] * len(images)
+    notes += [f"view {n} is {_short(path)}{more}" for n, (path, more) in enumerate(zip(images, beside, strict=True), 1)]
     return views
+
+
+def _short(path: Path) -> str:
+    """The file with its folder, as images of several folders often bear the same names."""
+    return str(Path(path.resolve().parent.name) / path.name)
 
 
 def _carm(folder: Path, given: NewCase, image: Path, notes: list[str]) -> str | dict[str, Any]:

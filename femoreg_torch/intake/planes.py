@@ -85,7 +85,8 @@ def _plane(
         ids = labels.data.select(2 - axis, at).numpy()
         for number, (red, green, blue) in colours.items():
             inside = ids == number
-            picture[inside] = (1 - _TINT) * picture[inside] + _TINT * np.array([blue, green, red], np.float32)
+            share = 1.0 if grey is None else _TINT
+            picture[inside] = (1 - share) * picture[inside] + share * np.array([blue, green, red], np.float32)
     return picture.astype(np.uint8)
 
 

@@ -83,7 +83,8 @@ def _write_sides(panel: Picture, case: Case, scene: Scene, poses: Poses) -> None
     to_left = float(poses.camera_from(scene.anchor)[0][0, 0])
     names = ("L", "R") if to_left < 0 else ("R", "L")
     for name, column in zip(names, (8, panel.shape[1] - 22), strict=True):
-        cv2.putText(panel, name, (column, 24), _FONT, 0.7, _WHITE, 2, cv2.LINE_AA)
+        for colour, width in (((0, 0, 0), 5), (_WHITE, 2)):  # a white letter is seen on a white background, too
+            cv2.putText(panel, name, (column, 24), _FONT, 0.7, colour, width, cv2.LINE_AA)
 
 
 def _write(

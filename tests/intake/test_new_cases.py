@@ -108,7 +108,7 @@ def test_a_case_from_two_dicom_folders(files: Path, tmp_path: Path, capsys: pyte
     told = capsys.readouterr().out
     assert "the operated side is the left one" in told
     assert "source to detector 1000 mm, pixels of 4 mm" in told
-    assert "view 2 is run2 and run2 with the device" in told
+    assert "view 2 is plain/run2, with the device device/run2" in told
     case = read_case(tmp_path / "case")
     assert case.side == "left"
     assert case.plan is not None
