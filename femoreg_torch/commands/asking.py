@@ -1,5 +1,6 @@
 """Asking in the terminal for what a new case lacks."""
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ def ask_for_missing(given: NewCase, console: Console) -> NewCase:
             continue
         answer = _answer(question, console, name in _MAY_BE_EMPTY)
         if answer:
-            paths = tuple(Path(word) for word in answer.split())
+            paths = tuple(Path(word) for word in shlex.split(answer))
             answered: dict[str, Any] = {name: paths if name in ("images", "device_images") else Path(answer)}
             given = replace(given, **answered)
     if given.bones is None and given.labels is not None and given.labels.exists() and not has_names(given.labels):

@@ -181,6 +181,12 @@ def _told_apart(
 
 def nearest_label(labels: Volume, ids: Sequence[int], point: Tensor) -> int | None:
     """The label among `ids` of the voxel closest to a point (3,), or None if none of them is near."""
+    found = nearest_voxel(labels, ids, point)
+    return None if found is None else found[0]
+
+
+def nearest_voxel(labels: Volume, ids: Sequence[int], point: Tensor) -> tuple[int, float] | None:
+    """Label and distance, mm, of the voxel with one of the `ids` closest to a point (3,), or None if none is near."""
     index = transform_points(torch.linalg.inv(labels.lps_from_index), point[None].double())[0].round().int()
     low = (index - _NEAR_VOXELS).clamp_min(0).tolist()
     high = (index + _NEAR_VOXELS + 1).clamp_min(0).tolist()
@@ -189,5 +195,7 @@ def nearest_label(labels: Volume, ids: Sequence[int], point: Tensor) -> int | No
     if len(where) == 0:
         return None
     offsets = (where.flip(1) + torch.tensor(low) - index).double() * torch.tensor(labels.spacing_mm).double()
-    z, y, x = where[offsets.norm(dim=1).argmin()].tolist()
-    return int(part[z, y, x])
+    distances = offsets.norm(dim=1)
+    nearest = int(distances.argmin())
+    z, y, x = where[nearest].tolist()
+    return int(part[z, y, x]), float(distances[nearest])

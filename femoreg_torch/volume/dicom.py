@@ -107,19 +107,22 @@ def series_in(folder: Path) -> list[Series]:
 
 
 def _headers(folder: Path) -> Iterator[Slice]:
+    for path in sorted(folder.rglob("*")):
+        if path.name.upper() != "DICOMDIR" and is_dicom(path):
+            yield Slice(path, _header(path))
+
+
+def _header(path: Path) -> Any:
+    """Some tags of a DICOM file, as a `pydicom.Dataset`. Raises `InputError`."""
     import pydicom  # a fifth of a second, and most CTs are of other kinds
     from pydicom.errors import InvalidDicomError
 
-    for path in sorted(folder.rglob("*")):
-        if path.name.upper() == "DICOMDIR" or not is_dicom(path):
-            continue
-        try:
-            header = pydicom.dcmread(path, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
-        except (InvalidDicomError, OSError, ValueError, AttributeError, KeyError) as error:
-            raise InputError(
-                f"{path}: its DICOM header cannot be read ({error}). Export the series anew, or take the file away."
-            ) from error
-        yield Slice(path, header)
+    try:
+        return pydicom.dcmread(path, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
+    except (InvalidDicomError, OSError, ValueError, AttributeError, KeyError) as error:
+        raise InputError(
+            f"{path}: its DICOM header cannot be read ({error}). Export the series anew, or take the file away."
+        ) from error
 
 
 def choose_series(path: Path, wanted: str | None = None) -> Series:
@@ -130,12 +133,11 @@ def choose_series(path: Path, wanted: str | None = None) -> Series:
     """
     folder = path if path.is_dir() else path.parent
     there = series_in(folder)
-    if not there:
-        raise InputError(
-            f"{folder}: holds no DICOM series. Give the folder of the slices, or a NIfTI, NRRD or MHA file."
-        )
+    if not there or (path.is_file() and not _header(path).get("SeriesInstanceUID")):
+        raise InputError(f"{path}: holds no DICOM series. Give the folder of the slices, or a NIfTI, NRRD or MHA file.")
     if path.is_file():
-        return next(one for one in there if any(part.path == path for part in one.slices))
+        uid = str(_header(path).get("SeriesInstanceUID") or "")
+        return next(one for one in there if one.uid == uid)
     if wanted is not None:
         exact = [one for one in there if wanted in (one.number, one.uid)]
         chosen = exact or [one for one in there if wanted.lower() in one.description.lower()]

@@ -1,17 +1,24 @@
-"""Segmentations whose parts have names: `.seg.nrrd` of 3D Slicer, a folder with a mask for each bone, DICOM SEG.
+"""Segmentations whose parts have names: `.seg.nrrd` of 3D Slicer, a folder with a mask for each bone, DICOM SEG, NIfTI
+with a label table in its header, as TotalSegmentator writes it.
 
 They become label maps with one value per voxel. Of two parts that overlap, the first keeps the voxels they share.
 
 Slicer keeps names in custom fields of the header, `Segment0_Name`, `Segment0_LabelValue`, `Segment0_Layer`, …, and
 overlapping segments in layers, the components of a voxel: 3D Slicer documentation, developer guide, Segmentations,
-"Segmentation labelmap file format". Names of DICOM segments are their Segment Labels (DICOM PS3.3, C.8.20.4).
+"Segmentation labelmap file format". Names of DICOM segments are their Segment Labels (DICOM PS3.3, C.8.20.4). The label
+table of a NIfTI file is XML in an extension of its header, elements `Label` with a `Key`: wasserth/TotalSegmentator,
+totalsegmentator/nifti_ext_header.py, after Connectome Workbench.
 """
 
 import re
+import zlib
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
+import nibabel
 import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
@@ -22,6 +29,7 @@ from femoreg_torch.volume.itk import read_itk
 
 SEGMENTATION_SUFFIX = ".seg.nrrd"
 _MASK_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha", ".mhd")
+_NIFTI_SUFFIXES = (".nii", ".nii.gz")
 _NAME = re.compile(r"Segment(\d+)_Name")
 _SAME_GRID_MM = 1e-3
 
@@ -33,13 +41,14 @@ class Segment:
     name: str
     label: int  # its value in the label map
     layer: int = 0  # of a segmentation of 3D Slicer
-    value: int = 1  # in its layer
+    value: int = 1  # in its layer, or in the label map
     path: Path | None = None  # of its mask
 
 
 def has_names(path: Path) -> bool:
     """Whether a file or folder is a segmentation whose parts have names."""
-    return path.is_dir() or path.name.lower().endswith(SEGMENTATION_SUFFIX) or is_dicom(path)
+    named = path.is_dir() or path.name.lower().endswith(SEGMENTATION_SUFFIX) or is_dicom(path)
+    return named or bool(_nifti_segments(path))
 
 
 def segment_names(path: Path) -> dict[str, tuple[int, ...]]:
@@ -65,6 +74,10 @@ def read_segments(path: Path, labels: Collection[int] | None = None) -> tuple[si
         return _merged(segments, _mask_reader(path))
     if path.is_dir() or is_dicom(path):
         return _merged(segments, _dicom_reader(path))
+    if all(one.layer == 0 and one.label == one.value for one in segments):  # a label map with names
+        image = read_itk(path)
+        if image.GetNumberOfComponentsPerPixel() == 1:
+            return image, ()
     return _merged(segments, _layer_reader(path))
 
 
@@ -76,7 +89,7 @@ def _segments(path: Path) -> list[Segment]:
         return [Segment(name, n, path=mask) for n, (name, mask) in enumerate(zip(names, masks, strict=True), 1)]
     if path.is_dir() or is_dicom(path):
         return _dicom_segments(path)
-    return _slicer_segments(path)
+    return _nifti_segments(path) or _slicer_segments(path)
 
 
 def _merged(
@@ -142,6 +155,30 @@ def _same_grid(one: sitk.Image, other: sitk.Image) -> bool:
         return np.array([*corners, np.reshape(image.GetDirection(), (3, 3)) @ image.GetSpacing()])
 
     return one.GetSize() == other.GetSize() and bool(abs(frame(one) - frame(other)).max() < _SAME_GRID_MM)
+
+
+def _nifti_segments(path: Path) -> list[Segment]:
+    """The label table in the header of a NIfTI file; empty where there is none."""
+    if not path.is_file() or not path.name.lower().endswith(_NIFTI_SUFFIXES):
+        return []
+    try:
+        image: Any = nibabel.load(path)  # its declared type is that of all formats
+    except (nibabel.filebasedimages.ImageFileError, OSError, EOFError, ValueError, zlib.error):
+        return []  # which whoever reads the voxels tells
+    for extension in image.header.extensions:
+        text = extension.get_content()
+        if not isinstance(text, bytes) or b"<LabelTable" not in text:
+            continue
+        try:
+            labels = list(ElementTree.fromstring(text.strip(b"\0 \n")).iter("Label"))
+            found = [(str(label.text).strip(), int(label.attrib["Key"])) for label in labels]
+        except (ElementTree.ParseError, KeyError, ValueError) as error:
+            raise InputError(
+                f"{path}: the label table in its header is damaged ({error}). Save the map without it, and name "
+                "a table of its ids as `bones`."
+            ) from error
+        return [Segment(name, key, value=key) for name, key in found if key > 0]
+    return []
 
 
 def _slicer_segments(path: Path) -> list[Segment]:

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import Anatomy
-from femoreg_torch.volume.bones import BoneLabels, nearest_label
+from femoreg_torch.volume.bones import BoneLabels, nearest_label, nearest_voxel
 from femoreg_torch.volume.labels import label_box_centre
 
+_CLOSER_MM, _FAR_MM = 2.0, 30.0
 _RAS = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
 
 
@@ -31,7 +32,12 @@ def swapped_sides(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: A
                 "or the label map is mirrored. Exchange the two ids, or export it anew"
             )
     own, other = _votes(bones, landmarks, anatomy)
-    if len(other) > len(own):
+    if len(other) > len(own) and _mixed_up(bones, landmarks, anatomy):
+        told.append(
+            f"landmarks: {', '.join(other)} lie on the other side, and fit the bones better with x and y negated: the "
+            "file holds RAS and says LPS, or the other way round. Correct its coordinate system"
+        )
+    elif len(other) > len(own):
         told.append(
             f"landmarks: left and right are swapped: {', '.join(other)} lie on bones of the other side. Exchange the "
             "endings -l and -r"
@@ -55,6 +61,24 @@ def stray_landmarks(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy:
             "says LPS, or the other way round. Correct its coordinate system"
         ]
     return [f"landmarks: {', '.join(stray)} lie far from the bones that they are named after. Place them anew"]
+
+
+def _mixed_up(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy) -> bool:
+    """Whether landmarks lie much closer to the bones, of either side, with x and y negated."""
+    told = _misfit_mm(bones, landmarks, anatomy)
+    negated = _misfit_mm(bones, {name: point * _RAS for name, point in landmarks.items()}, anatomy)
+    return negated < told / 2 and told - negated > _CLOSER_MM
+
+
+def _misfit_mm(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy) -> float:
+    """Mean distance of landmarks from their bones or the mirrors of these; where none is near, that counts as far."""
+    distances = []
+    for mark in anatomy.landmarks:
+        sides = [name for name in (mark.bone, anatomy.bone(mark.bone).mirror) if name in bones.ids]
+        if mark.name in landmarks and sides:
+            found = nearest_voxel(bones.labels, [bones.ids[name] for name in sides], landmarks[mark.name])
+            distances.append(_FAR_MM if found is None else found[1])
+    return sum(distances) / max(len(distances), 1)
 
 
 def _votes(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy) -> tuple[list[str], list[str]]:

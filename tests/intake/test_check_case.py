@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 from intake_files import HEAD, case_content, landmarks, markups, ras_affine, write_content, write_files
 
+from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
+from femoreg_torch.errors import InputError
 from femoreg_torch.intake import check_case
 from femoreg_torch.intake.volumes import ct_warnings
+from femoreg_torch.registration import prepare_scene
 from femoreg_torch.volume import read_ct, read_label_map
 
 Content = dict[str, Any]
@@ -44,7 +47,7 @@ def few(c: Content, folder: Path) -> None:
 
 
 def flipped(c: Content, folder: Path) -> None:
-    """Points of RAS in a file that says LPS, of a CT whose middle is off the origin."""
+    """Points of RAS in a file that says LPS."""
     (folder / "landmarks.mrk.json").write_text(markups({k: (-x, -y, z) for k, (x, y, z) in landmarks().items()}))
 
 
@@ -80,6 +83,7 @@ FAULTS: dict[str, Fault] = {
     "swapped": (swapped, r"landmarks: left and right are swapped: .*Exchange the endings"),
     "outside": (lambda c, f: moved(c, f, "GSN-r", (-60, 380, 10)), r"landmark GSN-r at .* lies outside the CT"),
     "stray": (lambda c, f: moved(c, f, "ASIS-l", (10, -90, -110)), r"landmarks: ASIS-l lie far from the bones"),
+    "flipped": (flipped, r"landmarks: FH-l, .* fit the bones better with x and y negated: the file holds RAS"),
     "few": (few, r"landmarks: 3 of them, but the start pose takes at least 4"),
     "plan number": (lambda c, f: c["plan"].update(entry_point=[1, 2]), r"plan\.entry_point: a point \[x, y, z\]"),
     "plan far": (
@@ -137,7 +141,7 @@ BROKEN = [
     ("plan turned", "no start", "carm"),
     ("no femur", "view text", "intensity", "field"),
     ("no ct", "bad name", "guide"),
-    ("side", "swapped", "open mesh"),
+    ("side", "flipped", "open mesh"),
     ("table", "outside", "plan turned", "no base"),
     ("no views", "two materials", "stray"),
     ("attenuation", "few", "tip word", "extra key", "field"),
@@ -201,6 +205,21 @@ def test_swapped_bones_are_told(files: Path, tmp_path: Path) -> None:
     problems = check_case(folder, find_start=False).problems
     assert any("hip_left lies to the right of hip_right" in one for one in problems)
     assert any("femur_left lies to the right of femur_right" in one for one in problems)
+
+
+def test_the_registration_refuses_swapped_sides_and_tells_what_was_done_to_a_label_map(
+    files: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    write_content(folder, case_content())
+    image = nibabel.load(folder / "labels.nii.gz")
+    nibabel.save(image.slicer[2:, :, 1:], folder / "labels.nii.gz")
+    notes = prepare_scene(read_case(folder)).missing
+    assert any("labels.nii.gz has a grid of its own (4 × 4 × 4 mm): it was resampled" in note for note in notes)
+    swapped({}, folder)
+    with pytest.raises(InputError, match="landmarks: left and right are swapped"):
+        prepare_scene(read_case(folder))
 
 
 def test_what_is_no_case_is_told(tmp_path: Path) -> None:

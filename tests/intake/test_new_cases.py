@@ -263,3 +263,28 @@ def test_the_pictures_left_is_the_patients_right(files: Path) -> None:
     assert columns.mean() > axial.shape[1] / 2
     assert rows.mean() + 40 < axial.shape[0] / 2
     path.unlink()
+
+
+def test_in_a_terminal_what_is_missing_is_asked_for(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = iter(
+        [
+            str(files / "ct.nii.gz"),
+            str(files / "labels.nii.gz"),
+            "",  # landmarks cannot be left out: asked again
+            str(files / "landmarks.mrk.json"),
+            str(files / "plan.mrk.json"),
+            "",  # no device
+            f"{files / 'view1.png'} {files / 'view2.png'}",
+            "femoreg",
+            str(files / "carm.yaml"),
+        ]
+    )
+    monkeypatch.setattr("builtins.input", lambda *_: next(answers))
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    assert main(["new-case", str(tmp_path / "case")]) == 0, capsys.readouterr().err
+    assert next(answers, None) is None
+    case = read_case(tmp_path / "case")
+    assert len(case.views) == 2
+    assert "device" not in case.objects

@@ -6,7 +6,9 @@ import highdicom
 import numpy as np
 import pydicom
 import pytest
+import SimpleITK as sitk
 import torch
+from highdicom.legacy import LegacyConvertedEnhancedCTImage
 from highdicom.seg import Segmentation, SegmentDescription
 from pydicom.dataset import FileMetaDataset
 from pydicom.sr.codedict import codes
@@ -134,6 +136,46 @@ def test_index_axes_end_along_left_back_and_head(tmp_path: Path, axes: np.ndarra
     volume = read_ct(tmp_path / "ct")
     assert (volume.lps_from_index[:3, :3].diagonal() > 0.5).all()
     np.testing.assert_array_equal(sampled(volume, points_of(axes, NO_LEAN)), VALUES - 1024)
+
+
+@pytest.mark.parametrize("compressor", ["JPEG", "JPEG2000", "JPEGLS"])
+def test_series_that_gdcm_compressed(tmp_path: Path, compressor: str) -> None:
+    """Lossless JPEG, JPEG 2000 and JPEG-LS, as SimpleITK writes them; headers then as pydicom writes them."""
+    folder = tmp_path / "ct"
+    for number, data in enumerate(write_series(folder, OBLIQUE)):
+        path = folder / f"IM{250 - number:04d}"
+        writer = sitk.ImageFileWriter()
+        writer.KeepOriginalImageUIDOn()
+        writer.UseCompressionOn()
+        writer.SetCompressor(compressor)
+        writer.SetImageIO("GDCMImageIO")
+        image = sitk.Cast(sitk.ReadImage(str(path)), sitk.sitkInt16)
+        writer.SetFileName(str(tmp_path / "one.dcm"))
+        writer.Execute(image)
+        packed = pydicom.dcmread(tmp_path / "one.dcm")
+        assert packed.file_meta.TransferSyntaxUID.is_compressed
+        packed.SeriesInstanceUID, packed.SOPInstanceUID = data.SeriesInstanceUID, data.SOPInstanceUID
+        packed.ImagePositionPatient, packed.PixelSpacing = data.ImagePositionPatient, data.PixelSpacing
+        packed.ImageOrientationPatient = data.ImageOrientationPatient
+        packed.save_as(path)
+    np.testing.assert_array_equal(sampled(read_ct(folder), points_of(OBLIQUE, NO_LEAN)), VALUES - 1024)
+
+
+def test_an_enhanced_ct_in_one_file(tmp_path: Path) -> None:
+    slices = write_series(tmp_path / "ct", OBLIQUE)
+    for data in slices:
+        data.KVP, data.ContrastBolusAgent, data.BodyPartExamined = 120, "", "HIP"
+    whole = LegacyConvertedEnhancedCTImage(
+        legacy_datasets=slices,
+        series_instance_uid=generate_uid(),
+        series_number=7,
+        sop_instance_uid=generate_uid(),
+        instance_number=1,
+    )
+    (tmp_path / "enhanced").mkdir()
+    whole.save_as(tmp_path / "enhanced" / "one.dcm")
+    volume = read_ct(tmp_path / "enhanced")
+    np.testing.assert_array_equal(sampled(volume, points_of(OBLIQUE, NO_LEAN)), VALUES - 1024)
 
 
 def test_fractional_rescale(tmp_path: Path) -> None:

@@ -71,6 +71,48 @@ def test_every_index_order_ends_in_lps_with_its_points_in_place(
     assert (cosines.diagonal() > 0.8).all()  # index axes run along +L, +P, +S
 
 
+def big_endian(folder: Path, suffix: str, image: sitk.Image) -> Path:
+    """The image as a raw file whose numbers have their high bytes first, header written by hand."""
+    values = sitk.GetArrayFromImage(image).astype(">i2")
+    path, origin = folder / f"ct{suffix}", image.GetOrigin()
+    columns = np.reshape(image.GetDirection(), (3, 3)).T
+    if suffix == ".nii":
+        affine = np.eye(4)
+        affine[:3, :3], affine[:3, 3] = (columns.T * image.GetSpacing()), origin
+        header = nibabel.Nifti1Header(endianness=">")
+        header.set_data_dtype(">i2")
+        flip = np.diag([-1.0, -1, 1, 1])
+        nibabel.save(nibabel.Nifti1Image(values.transpose(2, 1, 0), flip @ affine, header), path)
+        return path
+    if suffix == ".nrrd":
+        vectors = " ".join(
+            f"({','.join(f'{v:.17g}' for v in axis * s)})" for axis, s in zip(columns, image.GetSpacing(), strict=True)
+        )
+        head = (
+            f"NRRD0004\ntype: int16\ndimension: 3\nspace: left-posterior-superior\nsizes: 8 9 7\nencoding: raw\n"
+            f"endian: big\nspace directions: {vectors}\nspace origin: ({','.join(map(str, origin))})\n\n"
+        )
+    else:
+        head = (
+            f"ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = True\n"
+            f"TransformMatrix = {' '.join(f'{v:.17g}' for v in columns.ravel())}\n"
+            f"Offset = {' '.join(map(str, origin))}\n"
+            f"ElementSpacing = {' '.join(map(str, image.GetSpacing()))}\nDimSize = 8 9 7\n"
+            "ElementType = MET_SHORT\nElementDataFile = LOCAL\n"
+        )
+    path.write_bytes(head.encode() + values.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nrrd", ".mha"])
+@pytest.mark.parametrize("direction", ["oblique", "oblique left-handed"])
+def test_big_endian_files(tmp_path: Path, suffix: str, direction: str) -> None:
+    image = ct_image(DIRECTIONS[direction])
+    volume = read_ct(big_endian(tmp_path, suffix, image))
+    assert volume.data.aminmax() == (-1000, 1200)
+    np.testing.assert_allclose(brightest_point(volume), image.TransformIndexToPhysicalPoint(BRIGHT), atol=1e-4)
+
+
 @pytest.mark.parametrize("dtype", [np.int32, np.float32, np.int16])
 def test_voxel_types(tmp_path: Path, dtype: type) -> None:
     sitk.WriteImage(ct_image(dtype=dtype), str(tmp_path / "ct.nii.gz"))

@@ -116,6 +116,30 @@ def test_a_folder_with_a_mask_for_each_bone(tmp_path: Path, affine: np.ndarray) 
     assert labels.data[index[2], index[1], index[0]] == 1
 
 
+def test_the_label_table_in_a_nifti_header_of_totalsegmentator(tmp_path: Path) -> None:
+    """Its layout: totalsegmentator/nifti_ext_header.py."""
+    values = np.zeros((8, 7, 6), np.uint8)
+    values[1:3], values[5:] = 75, 77
+    image = nibabel.Nifti1Image(values, RAS)
+    named = {75: "femur_left", 77: "hip_left", 5: "liver"}
+    labels = "".join(f'<Label Key="{n}" Red="1.0"><![CDATA[{name}]]></Label>\n' for n, name in named.items())
+    xml = (
+        '<?xml version="1.0" encoding="UTF-8"?> <CaretExtension>  <VolumeInformation Index="0">   <LabelTable>\n'
+        f"{labels}\n  </LabelTable>  </VolumeInformation></CaretExtension>\n   "
+    )
+    image.header.extensions.append(nibabel.nifti1.Nifti1Extension(0, xml.encode()))
+    path = tmp_path / "segmentation.nii.gz"
+    nibabel.save(image, path)
+    assert segment_names(path) == {"femur_left": (75,), "hip_left": (77,), "liver": (5,)}
+    table = read_bones(Fields({"labels": path.name}, "case.yaml"), tmp_path, HIP)
+    assert table == {"femur_left": (75,), "hip_left": (77,)}
+    assert read_label_map(path).data.unique().tolist() == [0, 75, 77]
+    image.header.extensions[0] = nibabel.nifti1.Nifti1Extension(0, xml.replace("</Label>", "", 1).encode())
+    nibabel.save(image, path)
+    with pytest.raises(InputError, match="the label table in its header is damaged"):
+        segment_names(path)
+
+
 def test_folders_that_are_no_masks_are_told(tmp_path: Path) -> None:
     masks = {"hip_left": np.ones((4, 4, 4)), "hip_right": np.arange(64).reshape(4, 4, 4)}
     folder = write_masks(tmp_path / "values", masks, RAS)
