@@ -40,9 +40,9 @@ def label_ids(value: object, where: str) -> tuple[int, ...]:
 
 
 def bone_of_name(anatomy: Anatomy, text: str) -> str | None:
-    """The bone that another program calls by this name (a segment of 3D Slicer, a file), or None."""
+    """The bone, or group of bones, that another program calls by this name (a segment, a file), or None."""
     wanted = " ".join(text.replace("_", " ").replace("-", " ").lower().split())
     for bone in anatomy.bones:
         if wanted in (bone.name.replace("_", " "), *bone.names):
             return bone.name
-    return None
+    return next((group for group in anatomy.groups if wanted == group.replace("_", " ")), None)

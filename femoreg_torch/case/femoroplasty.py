@@ -19,7 +19,7 @@ class Device:
 
     model: Model
     points: dict[str, Tensor]  # those of DEVICE_POINTS
-    camera1_from_device: Tensor  # (4, 4), nominal start pose
+    start: Start  # at a nominal pose in camera 1, or beside the femur
 
 
 def operated_femur(side: Side) -> str:
@@ -50,16 +50,16 @@ def _device_object(device: Device) -> CaseObject:
         reference=device.points["center"],
         points=device.points,
         images=(DEVICE_IMAGES,),
-        start=Start(camera1_from=device.camera1_from_device),
+        start=device.start,
     )
 
 
 def device_of(case: Case) -> Device | None:
     """The device of a femoroplasty, or None."""
     thing = case.objects.get(DEVICE)
-    if thing is None or thing.model is None or thing.start.camera1_from is None:
+    if thing is None or thing.model is None or thing.start.by_landmarks:
         return None
-    return Device(thing.model, thing.points, thing.start.camera1_from)
+    return Device(thing.model, thing.points, thing.start)
 
 
 def with_device(case: Case, device: Device) -> Case:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import cast
 
-import torch
+from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, LabelTable
 from femoreg_torch.anatomy.tables import label_ids
@@ -12,6 +12,7 @@ from femoreg_torch.case.femoroplasty import (
     DEVICE,
     DEVICE_IMAGES,
     DEVICE_POINTS,
+    FEMUR,
     PELVIS,
     TEMPLATE,
     Device,
@@ -21,8 +22,9 @@ from femoreg_torch.case.femoroplasty import (
     planned,
 )
 from femoreg_torch.case.fields import Fields
-from femoreg_torch.case.model import Case, Side, View
+from femoreg_torch.case.model import Case, PlannedPath, Side, Start, View
 from femoreg_torch.case.models import MODEL_KEYS, read_model
+from femoreg_torch.case.nominal import ALONG_PATH, NominalPlace, bone_from_device
 from femoreg_torch.case.objects import check_guide, checked_path, plan_points
 from femoreg_torch.case.parts import (
     read_bones,
@@ -34,16 +36,19 @@ from femoreg_torch.case.parts import (
     with_known_poses,
 )
 from femoreg_torch.errors import InputError
-from femoreg_torch.volume import read_landmarks
+from femoreg_torch.settings import read_record
+from femoreg_torch.volume import read_landmarks, read_path_points
 
 SIDES: tuple[Side, ...] = ("left", "right")
-_KEYS = ("version", "side", "ct", "landmarks", "plan", "device", "carm", "views", "truth")
+KEYS = ("version", "side", "ct", "landmarks", "plan", "device", "carm", "views", "truth")
+VIEW_KEYS = (ANATOMY_IMAGES, DEVICE_IMAGES, "intensity", "camera_from_camera1", "field")
+DEVICE_STARTS = (f"camera1_from_{DEVICE}", f"{FEMUR}_from_{DEVICE}", "start")
 _STRUCTURES = (PELVIS, *(operated_femur(side) for side in SIDES))
 
 
 def read_femoroplasty(top: Fields, folder: Path) -> Case:
     """The case of a `template: femoroplasty`. Raises `InputError` that names file and key."""
-    top.only("template", *_KEYS)
+    top.only("template", *KEYS)
     ct = top.mapping("ct").only("image", "labels", "bones")
     bones = read_bones(ct, folder, HIP) if "labels" in ct else {}
     return _read(top, folder, ct, bones)
@@ -51,7 +56,7 @@ def read_femoroplasty(top: Fields, folder: Path) -> Case:
 
 def read_version_1(top: Fields, folder: Path) -> Case:
     """The case of a file of version 1. Raises `InputError` that names file and key."""
-    top.only(*_KEYS)
+    top.only(*KEYS)
     ct = top.mapping("ct").only("image", "labels", "structures")
     side = _side(top)
     bones = _structures(ct, side) if "structures" in ct or "labels" in ct else {}
@@ -92,10 +97,10 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
     if head not in landmarks:
         raise InputError(f"{top.where('landmarks')}: {head}, the head of the operated femur, is missing.")
     views = tuple(_view(view, folder) for view in top.mappings("views")) if "views" in top else ()
-    device = _device(top.mapping("device"), folder) if "device" in top else None
+    entry_point, target, file = read_path(top, folder, landmarks, side)
+    path = checked_path(planned(side, entry_point, target, None), top.where("plan"))
+    device = read_device(top.mapping("device"), folder, path, side) if "device" in top else None
     objects = femoroplasty_objects(side, landmarks[head], device)
-    plan, file = plan_points(top.mapping("plan").only("file", "entry_point", "target"), folder, side)
-    path = planned(side, plan.point("entry_point"), _target(plan, landmarks, side), device, file)
     return Case(
         folder=folder,
         carm=read_carm(top),
@@ -103,17 +108,32 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
         views=with_known_poses(views, top),
         anatomy=HIP,
         ct_path=ct.file_path("image", folder, may_be_folder=True),
-        labels_path=ct.file_path("labels", folder) if "labels" in ct else None,
+        labels_path=ct.file_path("labels", folder, may_be_folder=True) if "labels" in ct else None,
         bones=bones,
         landmarks=landmarks,
-        plan=checked_path(path, plan),
+        plan=planned(side, entry_point, target, device, file),
         truth=read_truth(top, folder, list(objects), len(views)),
         template=TEMPLATE,
         side=side,
     )
 
 
-def _target(plan: Fields, landmarks: dict[str, torch.Tensor], side: Side) -> torch.Tensor:
+def read_path(
+    top: Fields, folder: Path, landmarks: dict[str, Tensor], side: Side
+) -> tuple[Tensor, Tensor, Path | None]:
+    """Entry point (3,) and target (3,), LPS mm, under `plan`, and the plan.json that they stand in, if any.
+
+    They are points, a file of markups of 3D Slicer, or those of the plan.json. Without a target it is the operated
+    femoral head. Raises `InputError`.
+    """
+    if isinstance(top.value("plan", "{entry_point, target} or a file of 3D Slicer markups"), str):
+        entry_point, end = read_path_points(top.file_path("plan", folder))
+        return entry_point, landmarks[femoral_head(side)] if end is None else end, None
+    plan, file = plan_points(top.mapping("plan").only("file", "entry_point", "target"), folder, side)
+    return plan.point("entry_point"), _target(plan, landmarks, side), file
+
+
+def _target(plan: Fields, landmarks: dict[str, Tensor], side: Side) -> Tensor:
     target = plan.value("target", "a landmark, as FH, or a point [x, y, z]")
     if not isinstance(target, str):
         return plan.point("target")
@@ -129,16 +149,48 @@ def _target(plan: Fields, landmarks: dict[str, torch.Tensor], side: Side) -> tor
     return landmarks[name]
 
 
-def _device(device: Fields, folder: Path) -> Device:
-    device.only(*MODEL_KEYS, "points", f"camera1_from_{DEVICE}")
-    named = device.mapping("points").only(*DEVICE_POINTS)
-    points = {name: named.point(name) for name in DEVICE_POINTS}
-    check_guide(points, named.where("tip"))
-    return Device(read_model(device, folder), points, device.transform(f"camera1_from_{DEVICE}"))
+def read_device(device: Fields, folder: Path, path: PlannedPath, side: Side) -> Device:
+    """The device, with its nominal pose told in one of three ways. Raises `InputError`."""
+    device.only(*MODEL_KEYS, "points", *DEVICE_STARTS)
+    points = read_device_points(device, folder)
+    return Device(read_model(device, folder), points, read_device_start(device, folder, path, side, points))
+
+
+def read_device_points(device: Fields, folder: Path) -> dict[str, Tensor]:
+    """The points (3,) of the device, mm in its space: written out, or a file of markups. Raises `InputError`."""
+    if isinstance(device.value("points", "{tip, base, center}, or a file of 3D Slicer markups"), str):
+        points = read_landmarks(device.file_path("points", folder), DEVICE_POINTS)
+        if missing := [name for name in DEVICE_POINTS if name not in points]:
+            raise InputError(f"{device.where('points')}: the file lacks {', '.join(missing)}.")
+    else:
+        named = device.mapping("points").only(*DEVICE_POINTS)
+        points = {name: named.point(name) for name in DEVICE_POINTS}
+    check_guide(points, f"{device.where('points')}.tip")
+    return points
+
+
+def read_device_start(device: Fields, folder: Path, path: PlannedPath, side: Side, points: dict[str, Tensor]) -> Start:
+    """The nominal pose: in camera 1, beside the femur, or in words. Raises `InputError`."""
+    in_camera, beside, words = DEVICE_STARTS
+    told = [key for key in DEVICE_STARTS if key in device]
+    if len(told) != 1:
+        found = " and ".join(f"`{key}`" for key in told) or "none"
+        raise InputError(
+            f"{device.where(in_camera)}: is missing, the nominal pose of the device was expected once, as "
+            f"`{in_camera}` (4×4), `{beside}` (4×4 or a transform of 3D Slicer), or `{words}: {{guide: {ALONG_PATH}, "
+            f"before_entry_mm: 20}}`; found {found}."
+        )
+    if in_camera in device:
+        return Start(camera1_from=device.transform(in_camera))
+    if beside in device:
+        return Start(beside=FEMUR, beside_from_object=device.transform_or_file(beside, folder))
+    sentence = device.mapping(words)
+    place = read_record(NominalPlace, sentence.content, device.where(words))
+    return Start(beside=FEMUR, beside_from_object=bone_from_device(place, path, side, points))
 
 
 def _view(view: Fields, folder: Path) -> View:
-    view.only(ANATOMY_IMAGES, DEVICE_IMAGES, "intensity", "camera_from_camera1", "field")
+    view.only(*VIEW_KEYS)
     images = {ANATOMY_IMAGES: view.file_path(ANATOMY_IMAGES, folder)}
     if DEVICE_IMAGES in view:
         images[DEVICE_IMAGES] = view.file_path(DEVICE_IMAGES, folder)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import check_rigid
+from femoreg_torch.geometry import check_rigid, read_itk_transform
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,12 @@ class Fields:
     def transform(self, key: str) -> Tensor:
         """The rigid 4×4 transform, float64, under `key`."""
         return check_rigid(self._numbers(key, (4, 4), "a 4×4 matrix"), self.where(key))
+
+    def transform_or_file(self, key: str, folder: Path) -> Tensor:
+        """The rigid 4×4 transform, float64, under `key`, or of the ITK or 3D Slicer file that stands there."""
+        if isinstance(self.value(key, "a 4×4 matrix, or a transform of 3D Slicer (.tfm, .h5)"), str):
+            return read_itk_transform(self.file_path(key, folder))
+        return self.transform(key)
 
     def transforms(self, key: str) -> Tensor:
         """The list of rigid transforms under `key` as (V, 4, 4), float64."""

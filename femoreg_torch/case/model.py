@@ -30,6 +30,12 @@ class Start:
     beside_from_object: Tensor = dataclasses.field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
 
     @property
+    def nominal(self) -> bool:
+        """Whether it is where something is meant to be, and not where the CT has it."""
+        moved = not torch.equal(self.beside_from_object, torch.eye(4, dtype=torch.float64))
+        return self.camera1_from is not None or (self.beside is not None and moved)
+
+    @property
     def by_landmarks(self) -> bool:
         """Whether landmarks place it."""
         return self.camera1_from is None and self.beside is None

@@ -142,13 +142,14 @@ def read_plan(
         end = known[target]
     else:
         end = points.point("target")
-    return checked_path(PlannedPath(name, points.point("entry_point"), end, tool, file), points)
+    path = PlannedPath(name, points.point("entry_point"), end, tool, file)
+    return checked_path(path, f"{points.file}, {points.path}")
 
 
-def checked_path(path: PlannedPath, plan: Fields) -> PlannedPath:
-    """The path, if it has a direction. Raises `InputError`."""
+def checked_path(path: PlannedPath, where: str) -> PlannedPath:
+    """The path, if it has a direction. Raises `InputError` that starts with `where` the plan stands."""
     if not (path.target - path.entry_point).norm() > 1e-6:
-        raise InputError(f"{plan.where('entry_point')}: is the target itself, so the path has no direction.")
+        raise InputError(f"{where}.entry_point: is the target itself, so the path has no direction.")
     return path
 
 

@@ -15,7 +15,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json
 from femoreg_torch.fluoro import Circle, Polygon
 from femoreg_torch.geometry import CArm, Poses, carm_from_dict, load_carm
-from femoreg_torch.volume.segments import segment_names
+from femoreg_torch.volume import has_names, segment_names
 
 ONE_KIND = "image"  # the kind of images where a view has one alone
 
@@ -40,12 +40,13 @@ def read_anatomy_and_bones(top: Fields, folder: Path) -> tuple[Anatomy | None, L
 def read_bones(ct: Fields, folder: Path, anatomy: Anatomy | None) -> LabelTable:
     """Ids by bone under `bones`: a table's name, a table's YAML file, or a mapping of bones to ids.
 
-    For a segmentation of 3D Slicer (`.seg.nrrd`) the names of its segments say it. Raises `InputError`.
+    For a segmentation whose parts have names (`.seg.nrrd`, a folder of masks, DICOM SEG) these say it. Raises
+    `InputError`.
     """
     where = ct.where("bones")
     if "bones" not in ct:
-        path = ct.file_path("labels", folder)
-        if not path.name.lower().endswith(".seg.nrrd"):
+        path = ct.file_path("labels", folder, may_be_folder=True)
+        if not has_names(path):
             raise InputError(
                 f"{where}: missing. Name the table of the label map (femoreg, totalsegmentator_v2, …), or its ids by "
                 "bone: {hip_left: 1, …}."
@@ -78,7 +79,7 @@ def _bones_of_segments(path: Path, anatomy: Anatomy | None, where: str) -> Label
         known = ", ".join(anatomy.bone_names)
         raise InputError(
             f"{where}: no segment of {path.name} is named after a bone; there are: {', '.join(segments)[:200]}. Rename "
-            f"them in 3D Slicer ({known}), or give their label values here."
+            f"them ({known}), or give their label values here."
         )
     return table
 

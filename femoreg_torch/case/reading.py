@@ -17,22 +17,30 @@ VERSIONS = (1, 2)
 _KEYS = ("version", "anatomy", "ct", "landmarks", "objects", "plan", "carm", "views", "truth")
 
 
-def read_case(folder: Path) -> Case:
-    """The case whose `case.yaml` stands in `folder`. Images and volumes are not opened yet, but must exist.
-
-    Raises `InputError` that names file and key for anything missing, unknown or of another kind than expected.
-    """
-    folder = Path(folder)
+def read_fields(folder: Path) -> Fields:
+    """The mapping in `case.yaml`. Raises `InputError` if it is missing or something else."""
     path = folder / "case.yaml"
     if not path.is_file():
-        raise InputError(f"{folder}: not a case folder, it holds no case.yaml. Make one with `femoreg simulate`.")
+        raise InputError(
+            f"{folder}: not a case folder, it holds no case.yaml. Make one with `femoreg new-case` or "
+            "`femoreg simulate`."
+        )
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())}).") from error
     if not isinstance(content, dict):
         raise InputError(f"{path}: a mapping of keys and values was expected, found {type(content).__name__}.")
-    top = Fields(content, str(path))
+    return Fields(content, str(path))
+
+
+def read_case(folder: Path) -> Case:
+    """The case whose `case.yaml` stands in `folder`. Images and volumes are not opened yet, but must exist.
+
+    Raises `InputError` that names file and key for anything missing, unknown or of another kind than expected.
+    """
+    folder = Path(folder)
+    top = read_fields(folder)
     version = top.value("version", " or ".join(map(str, VERSIONS)))
     if version not in VERSIONS or isinstance(version, bool):
         known = " and ".join(map(str, VERSIONS))
@@ -69,7 +77,7 @@ def _read_objects(top: Fields, folder: Path) -> Case:
         views=with_known_poses(views, top),
         anatomy=anatomy,
         ct_path=ct.file_path("image", folder, may_be_folder=True) if ct else None,
-        labels_path=ct.file_path("labels", folder) if ct and "labels" in ct else None,
+        labels_path=ct.file_path("labels", folder, may_be_folder=True) if ct and "labels" in ct else None,
         bones=bones,
         landmarks=landmarks,
         plan=read_plan(top.mapping("plan"), folder, objects, landmarks) if "plan" in top else None,

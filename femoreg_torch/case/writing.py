@@ -10,7 +10,7 @@ import yaml
 from torch import Tensor
 
 from femoreg_torch.anatomy import LabelTable, label_table, label_table_names
-from femoreg_torch.case.femoroplasty import DEVICE, Device, device_of, femoral_head
+from femoreg_torch.case.femoroplasty import DEVICE, FEMUR, Device, device_of, femoral_head
 from femoreg_torch.case.model import Case, CaseObject, Model, Part, PlannedPath, Start, View
 from femoreg_torch.case.parts import ONE_KIND
 from femoreg_torch.case.poses import poses_content
@@ -97,7 +97,12 @@ def _points_of(case: Case, plan: PlannedPath) -> dict[str, Any]:
 
 
 def _device(device: Device, folder: Path) -> dict[str, Any]:
-    pose = {f"camera1_from_{DEVICE}": device.camera1_from_device}
+    start = device.start
+    pose = (
+        {f"{FEMUR}_from_{DEVICE}": start.beside_from_object}
+        if start.camera1_from is None
+        else {f"camera1_from_{DEVICE}": start.camera1_from}
+    )
     return _model(device.model, folder) | {"points": device.points} | pose
 
 
@@ -139,8 +144,7 @@ def _start(start: Start) -> Any:
         return "landmarks"
     if start.camera1_from is not None:
         return {"camera1_from": start.camera1_from}
-    moved = not torch.equal(start.beside_from_object, torch.eye(4, dtype=torch.float64))
-    return {"beside": start.beside} | ({"beside_from_object": start.beside_from_object} if moved else {})
+    return {"beside": start.beside} | ({"beside_from_object": start.beside_from_object} if start.nominal else {})
 
 
 def _plan(plan: PlannedPath, folder: Path) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 A command is a plain typed function that an installed package names in the entry-point group
 `femoreg_torch.commands`; its Google docstring is its help. Parameters without a default that come before a `*` are
-positional (a `list[…]` takes one or more values), all others are options; `Annotated[int, "-n"]` adds a short form.
+positional (a `list[…]` takes one or more values), all others are options (a `tuple[…, ...]` takes several values);
+`Annotated[int, "-n"]` adds a short form.
 Only the chosen command is imported.
 """
 
@@ -135,6 +136,8 @@ def _argument(parameter: inspect.Parameter, hint: Any) -> tuple[list[str], dict[
     settings: dict[str, Any] = {"dest": parameter.name}
     if required:
         settings |= {"type": hint, "required": True}
+    elif get_origin(hint) is tuple:
+        settings |= {"type": get_args(hint)[0], "nargs": "+", "default": list(parameter.default)}
     elif parameter.default is False:
         settings |= {"action": "store_true"}
     else:

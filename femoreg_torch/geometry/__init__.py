@@ -2,6 +2,7 @@
 
 from femoreg_torch.geometry.camera import Camera, CameraChange, centred_camera, project_points
 from femoreg_torch.geometry.carm import CArm, Uncertainty, carm_from_dict, load_carm, orbit_angles
+from femoreg_torch.geometry.itk_files import read_itk_transform
 from femoreg_torch.geometry.poses import Poses, first_view_only, poses_by_object
 from femoreg_torch.geometry.rigid import (
     about_point,
@@ -41,6 +42,7 @@ __all__ = [
     "pose_difference",
     "poses_by_object",
     "project_points",
+    "read_itk_transform",
     "rigid",
     "rotation_angle",
     "transform_points",

@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import SimpleITK as sitk
 import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import check_rigid, invert_rigid, rigid
+from femoreg_torch.geometry import check_rigid, read_itk_transform, rigid
 
 _LEAST_REACH_MM = 10.0  # no tool stands this close to the base of its robot: the numbers are metres
 
@@ -55,7 +54,7 @@ def read_robot(path: Path, tool: str) -> Robot:
     path, names = Path(path), _Names(tool)
     if not path.is_file():
         raise InputError(f"{path}: no such file. The robot's calibration holds {names.format}.")
-    found = {path.stem: _read_tfm(path)} if path.suffix.lower() == ".tfm" else _read_text(path, names)
+    found = {path.stem: read_itk_transform(path)} if path.suffix.lower() == ".tfm" else _read_text(path, names)
     if set(found) not in (names.direct, names.by_flange):
         there = ", ".join(f"`{name}`" for name in found) or "no matrix"
         raise InputError(f"{path}: holds {there}. Expected: {names.format}.")
@@ -108,20 +107,3 @@ def _row(words: list[str], where: str) -> list[float]:
     if len(values) != 4:
         raise InputError(f"{where}: four numbers or the name of a matrix were expected, found {' '.join(words)!r}.")
     return values
-
-
-def _read_tfm(path: Path) -> Tensor:
-    """`b_from_a` (4, 4) of a file that takes points of b to a."""
-    try:
-        transform = sitk.ReadTransform(str(path))
-    except RuntimeError as error:
-        reason = " ".join(str(error).split()).rpartition("): ")[2]
-        raise InputError(f"{path}: cannot be read as an ITK transform ({reason}).") from error
-    if transform.GetDimension() != 3 or not transform.IsLinear():
-        raise InputError(f"{path}: a rigid transform in 3D was expected, found {transform.GetName()}.")
-    origin, *axes = (
-        torch.tensor(transform.TransformPoint(point), dtype=torch.float64)
-        for point in ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    )
-    a_from_b = rigid(torch.stack([axis - origin for axis in axes], 1), origin)
-    return invert_rigid(check_rigid(a_from_b, str(path)))

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -31,10 +31,11 @@ from femoreg_torch.volume import (
     check_inside,
     hu_to_attenuation,
     label_box_centre,
-    read_ct,
-    read_labels,
+    read_ct_told,
+    read_labels_told,
     resample_isotropic,
     structure_attenuation,
+    swapped_sides,
 )
 
 REGISTRATION_SPACING_MM = 1.0  # the paper resamples the CT to 1 mm (section III-A)
@@ -58,11 +59,14 @@ def prepare_scene(case: Case) -> Scene:
         if from_ct:
             ct, bones = read_bones(case)
             check_inside(case.landmarks, ct)
+            if swapped := swapped_sides(bones, case.landmarks, case.anatomy):
+                raise InputError(f"{case.folder}: {'; '.join(swapped)}.")
             soft = resample_isotropic(ct.with_data(ct.data.clamp_max(SOFT_HU)), TISSUE_SPACING_MM)
             tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
             outline = outline_of(bones, case.anatomy)
         images, fields, told = reading.result()
         if from_ct:
+            told = (*bones.notes, *told)
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
         made = {name: model.result() for name, model in making.items()}
     for name, volumes in made.items():
@@ -97,9 +101,10 @@ def read_bones(case: Case) -> tuple[Volume, BoneLabels]:
         raise InputError(f"{case.folder}/case.yaml, ct.image: missing. Bones are taken from a CT.")
     if case.labels_path is None:
         raise InputError(f"{case.folder}/case.yaml, ct.labels: missing. Give a label map of the bones.")
-    ct = read_ct(case.ct_path)
-    labels = read_labels(case.labels_path, ct)
-    return ct, bone_labels(labels, ct, case.bones, case.anatomy, case.landmarks)
+    ct, told = read_ct_told(case.ct_path)
+    labels, done = read_labels_told(case.labels_path, ct, {n for ids in case.bones.values() for n in ids})
+    bones = bone_labels(labels, ct, case.bones, case.anatomy, case.landmarks)
+    return ct, replace(bones, notes=(*told, *done))
 
 
 def ct_objects(

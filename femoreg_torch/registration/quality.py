@@ -169,7 +169,7 @@ def _displacement(scene: Scene, poses: Poses, name: str) -> tuple[float, float] 
 
 def _displaced(scene: Scene, name: str, displacement: tuple[float, float] | None, limits: Limits) -> str | None:
     start = scene.objects[name].start
-    if displacement is None or start.camera1_from is not None or displacement[1] <= limits.most_displacement_mm:
+    if displacement is None or start.nominal or displacement[1] <= limits.most_displacement_mm:
         return None  # how far from its nominal pose an object may lie, nobody knows
     return f"the {name} lies {displacement[1]:.1f} mm from its place beside the {start.beside}"
 

@@ -5,12 +5,22 @@ from femoreg_torch.volume.bones import BoneLabels, bone_labels
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
 from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
 from femoreg_torch.volume.labels import label_box_centre
-from femoreg_torch.volume.landmarks import check_inside, read_landmarks, write_landmarks
+from femoreg_torch.volume.landmarks import check_inside, read_landmarks, read_path_points, write_landmarks
 from femoreg_torch.volume.mesh import check_closed, voxelise_mesh
-from femoreg_torch.volume.mesh_files import bounds_of, read_bodies, read_mesh
-from femoreg_torch.volume.reading import read_ct, read_label_map, read_labels, read_volume, write_volume
+from femoreg_torch.volume.mesh_files import bounds_of, is_in_ras, read_bodies, read_mesh
+from femoreg_torch.volume.reading import (
+    read_ct,
+    read_ct_told,
+    read_label_map,
+    read_labels,
+    read_labels_told,
+    read_volume,
+    read_volume_told,
+    write_volume,
+)
 from femoreg_torch.volume.resample import crop, halved, resample_isotropic
-from femoreg_torch.volume.segments import segment_names
+from femoreg_torch.volume.segments import has_names, segment_names
+from femoreg_torch.volume.sides import stray_landmarks, swapped_sides
 from femoreg_torch.volume.solids import Solid, solid_volumes
 
 __all__ = [
@@ -25,22 +35,30 @@ __all__ = [
     "check_inside",
     "crop",
     "halved",
+    "has_names",
     "hu_to_attenuation",
+    "is_in_ras",
     "label_box_centre",
     "label_share",
     "labelled_device",
     "read_bodies",
     "read_ct",
+    "read_ct_told",
     "read_label_map",
     "read_labels",
+    "read_labels_told",
     "read_landmarks",
     "read_mesh",
+    "read_path_points",
     "read_volume",
+    "read_volume_told",
     "resample_isotropic",
     "scanned_device",
     "segment_names",
     "solid_volumes",
+    "stray_landmarks",
     "structure_attenuation",
+    "swapped_sides",
     "voxelise_mesh",
     "write_landmarks",
     "write_volume",

@@ -28,6 +28,7 @@ class BoneLabels:
     labels: Volume  # uint8, 0 where there is no bone
     ids: dict[str, int]  # of every bone that occurs in it, or of a group of bones that it does not tell apart
     absent: LabelTable = field(default_factory=dict)  # what the user's table names, and no voxel carries
+    notes: tuple[str, ...] = ()  # what had to be done to CT and label map, in words
 
     def of(self, bones: Sequence[str], anatomy: Anatomy | None) -> tuple[int, ...]:
         """Ids of bones and groups. Raises `InputError` for a bone that the map does not tell."""
@@ -162,7 +163,7 @@ def _told_apart(
     without = []
     for bone in anatomy.members(group):
         marks = [landmarks[mark] for mark in anatomy.landmarks_of(bone) if mark in landmarks]
-        votes = Counter(label for point in marks if (label := _nearest_label(labels, ids, point)) is not None)
+        votes = Counter(label for point in marks if (label := nearest_label(labels, ids, point)) is not None)
         if not votes:
             without.append(bone)
             continue
@@ -178,8 +179,14 @@ def _told_apart(
     return told | {bone: tuple(left) for bone in without if left}
 
 
-def _nearest_label(labels: Volume, ids: Sequence[int], point: Tensor) -> int | None:
+def nearest_label(labels: Volume, ids: Sequence[int], point: Tensor) -> int | None:
     """The label among `ids` of the voxel closest to a point (3,), or None if none of them is near."""
+    found = nearest_voxel(labels, ids, point)
+    return None if found is None else found[0]
+
+
+def nearest_voxel(labels: Volume, ids: Sequence[int], point: Tensor) -> tuple[int, float] | None:
+    """Label and distance, mm, of the voxel with one of the `ids` closest to a point (3,), or None if none is near."""
     index = transform_points(torch.linalg.inv(labels.lps_from_index), point[None].double())[0].round().int()
     low = (index - _NEAR_VOXELS).clamp_min(0).tolist()
     high = (index + _NEAR_VOXELS + 1).clamp_min(0).tolist()
@@ -188,5 +195,7 @@ def _nearest_label(labels: Volume, ids: Sequence[int], point: Tensor) -> int | N
     if len(where) == 0:
         return None
     offsets = (where.flip(1) + torch.tensor(low) - index).double() * torch.tensor(labels.spacing_mm).double()
-    z, y, x = where[offsets.norm(dim=1).argmin()].tolist()
-    return int(part[z, y, x])
+    distances = offsets.norm(dim=1)
+    nearest = int(distances.argmin())
+    z, y, x = where[nearest].tolist()
+    return int(part[z, y, x]), float(distances[nearest])

@@ -14,7 +14,7 @@ from femoreg_torch.files import read_json, write_json
 from femoreg_torch.volume.grid import Volume
 
 _LPS_FROM = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
-_FCSV_SPACES = {"0": "RAS", "1": "LPS", "RAS": "RAS", "LPS": "LPS"}  # numbers as in 3D Slicer before 4.11
+_SPACES = {"0": "RAS", "1": "LPS", "RAS": "RAS", "LPS": "LPS"}  # numbers as in 3D Slicer before 4.11
 _FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
 
 
@@ -29,7 +29,7 @@ def _check_unit(unit: Any, where: str) -> None:
         raise InputError(f"{where}: the unit must be mm, found {unit!r}. Convert the points.")
 
 
-def _plain_points(content: dict[str, Any], path: Path) -> tuple[Any, list[tuple[Any, Any]]]:
+def _plain_points(content: dict[str, Any], path: Path) -> list[tuple[Any, Any, Any]]:
     for key in ("space", "unit", "landmarks"):
         if key not in content:
             raise InputError(
@@ -39,32 +39,39 @@ def _plain_points(content: dict[str, Any], path: Path) -> tuple[Any, list[tuple[
     _check_unit(content["unit"], f"{path}, unit")
     if not isinstance(content["landmarks"], dict):
         raise InputError(f"{path}, landmarks: an object of names and points was expected.")
-    return content["space"], list(content["landmarks"].items())
+    return [(content["space"], name, value) for name, value in content["landmarks"].items()]
 
 
-def _slicer_points(content: dict[str, Any], path: Path) -> tuple[Any, list[tuple[Any, Any]]]:
+def _slicer_points(content: dict[str, Any], path: Path) -> list[tuple[Any, Any, Any]]:
+    """Space, name and position of every point that is placed, of all lists in the file."""
     markups = content["markups"]
-    if not isinstance(markups, list) or len(markups) != 1 or not isinstance(markups[0], dict):
+    if not isinstance(markups, list) or not markups or not all(isinstance(markup, dict) for markup in markups):
         raise InputError(f"{path}, markups: one list of points was expected.")
-    markup = markups[0]
-    _check_unit(markup.get("coordinateUnits", "mm"), f"{path}, coordinateUnits")
-    points = markup.get("controlPoints")
-    if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
-        raise InputError(f"{path}, controlPoints: a list of points was expected.")
-    placed = (point for point in points if point.get("positionStatus", "defined") == "defined")
-    return markup.get("coordinateSystem"), [(point.get("label"), point.get("position")) for point in placed]
+    found = []
+    for markup in markups:
+        _check_unit(markup.get("coordinateUnits", "mm"), f"{path}, coordinateUnits")
+        points = markup.get("controlPoints")
+        if not isinstance(points, list) or not all(isinstance(point, dict) for point in points):
+            raise InputError(f"{path}, controlPoints: a list of points was expected.")
+        placed = (point for point in points if point.get("positionStatus", "defined") == "defined")
+        space = markup.get("coordinateSystem")
+        found += [(_SPACES.get(str(space), space), point.get("label"), point.get("position")) for point in placed]
+    return found
 
 
-def _fcsv_points(path: Path) -> tuple[Any, list[tuple[Any, Any]]]:
+def _fcsv_points(path: Path) -> list[tuple[Any, Any, Any]]:
+    """Without a line that tells the space it is RAS: that of 3D Slicer before 4.11, and of xReg."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as an .fcsv file ({error}).") from error
     comments = (line.lstrip("# ").split("=", 1) for line in lines if line.startswith("#") and "=" in line)
     header = {key.strip(): value.strip() for key, value in comments}
-    space, columns = header.get("CoordinateSystem"), header.get("columns", _FCSV_COLUMNS).split(",")
+    space, columns = header.get("CoordinateSystem", "RAS"), header.get("columns", _FCSV_COLUMNS).split(",")
+    if missing := {"label", "x", "y", "z"} - set(columns):
+        raise InputError(f"{path}: its columns lack {', '.join(sorted(missing))}. Save it anew with 3D Slicer.")
     rows = csv.DictReader((line for line in lines if line.strip() and not line.startswith("#")), fieldnames=columns)
-    return _FCSV_SPACES.get(space or "", space), [(row["label"], [row["x"], row["y"], row["z"]]) for row in rows]
+    return [(_SPACES.get(space, space), row["label"], [row["x"], row["y"], row["z"]]) for row in rows]
 
 
 def _point(value: Any, where: str) -> Tensor:
@@ -80,30 +87,68 @@ def _point(value: Any, where: str) -> Tensor:
 def read_landmarks(path: Path, known: Sequence[str] | None = HIP.landmark_names) -> dict[str, Tensor]:
     """Landmarks (3,) float64, LPS mm, in the order of the `known` names; a file may hold fewer.
 
-    Without known names any will do, in the order of the file. Formats: `{"space": "LPS", "unit": "mm", "landmarks":
-    {name: [x, y, z]}}`, 3D Slicer markups (`.mrk.json`) and `.fcsv`, each in LPS or RAS as its header says. Raises
+    Without known names any will do, in the order of the file. Known names may be written in capitals or small letters,
+    with `_`, a space or nothing in place of `-`. Formats: `{"space": "LPS", "unit": "mm", "landmarks": {name: [x, y,
+    z]}}`, 3D Slicer markups (`.mrk.json`) and `.fcsv` (also of xReg), each in LPS or RAS as its header says. Raises
     `InputError` for an unknown or repeated name, another unit or space, or a point that is not three finite numbers.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
-    if path.suffix.lower() == ".fcsv":
-        space, points = _fcsv_points(path)
-    else:
-        content = read_json(path)
-        space, points = (_slicer_points if "markups" in content else _plain_points)(content, path)
-    signs = torch.tensor(_signs(space, f"{path}, coordinate system"), dtype=torch.float64)
     told = "" if known is None else f" Known names: {', '.join(known)}."
+    spelt = {} if known is None else {_plain_name(name): name for name in known}
     found: dict[str, Tensor] = {}
-    for name, value in points:
-        if not isinstance(name, str) or not name or (known is not None and name not in known):
-            raise InputError(f"{path}: unknown landmark {str(name)[:60]!r}.{told}")
+    for label, point in _points(path):
+        name = label if known is None else spelt.get(_plain_name(label), "")
+        if not name:
+            raise InputError(f"{path}: unknown landmark {label[:60]!r}.{told}")
         if name in found:
             raise InputError(f"{path}: landmark {name} stands there twice. Keep one.")
-        found[name] = _point(value, f"{path}, {name}") * signs
+        found[name] = point
     if not found:
         raise InputError(f"{path}: holds no landmark.{told}")
     return {name: found[name] for name in (known or found) if name in found}
+
+
+def _plain_name(text: str) -> str:
+    return "".join(letter for letter in text.lower() if letter not in " _-")
+
+
+def _points(path: Path) -> list[tuple[str, Tensor]]:
+    """Name and position (3,), LPS mm, of every point in a file, in its order. Raises `InputError`."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file.")
+    if path.suffix.lower() == ".fcsv":
+        points = _fcsv_points(path)
+    else:
+        content = read_json(path)
+        points = (_slicer_points if "markups" in content else _plain_points)(content, path)
+    found = []
+    for space, label, value in points:
+        name = label if isinstance(label, str) else ""
+        signs = torch.tensor(_signs(space, f"{path}, coordinate system"), dtype=torch.float64)
+        found.append((name, _point(value, f"{path}, {name}") * signs))
+    return found
+
+
+def read_path_points(path: Path) -> tuple[Tensor, Tensor | None]:
+    """Entry point (3,) and target (3,), or None, of a planned path, LPS mm, from a file of points or a line.
+
+    Points whose names hold `entry` or `target` are these; of a file without such names the first point is the entry
+    point and the second, if there is one, the target, as the ends of a line of 3D Slicer are. Raises `InputError` for
+    other numbers of points.
+    """
+    path = Path(path)
+    points = _points(path)
+    entries = [point for name, point in points if "entry" in name.lower()]
+    targets = [point for name, point in points if "target" in name.lower()]
+    if not entries and not targets and len(points) in (1, 2):
+        entries, targets = [points[0][1]], [point for _, point in points[1:]]
+    if len(entries) != 1 or len(targets) > 1:
+        names = ", ".join(name or "(no name)" for name, _ in points) or "none"
+        raise InputError(
+            f"{path}: a line, or points named `entry` and `target`, were expected; found {len(points)} points: "
+            f"{names[:120]}. Rename them in 3D Slicer."
+        )
+    return entries[0], targets[0] if targets else None
 
 
 def write_landmarks(path: Path, landmarks: Mapping[str, Tensor]) -> None:

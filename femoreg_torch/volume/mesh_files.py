@@ -65,6 +65,12 @@ def bounds_of(meshes: "Sequence[trimesh.Trimesh]", where: str) -> np.ndarray:
     return bounds
 
 
+def is_in_ras(path: Path) -> bool:
+    """Whether 3D Slicer wrote into the file that its coordinates are RAS; without a word they are LPS to Slicer."""
+    with path.open("rb") as file:
+        return b"SPACE=RAS" in file.read(512)
+
+
 def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, trimesh.Trimesh]":
     """The surfaces of a file by name, where they stand in the file's scene, in mm. OBJ files can be split."""
     import trimesh  # takes most of a second, which reading of the CT hides

@@ -1,5 +1,6 @@
 """Reading and writing of volumes. Whatever the index order of a file, index axes inside run along +L, +P, +S."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +11,31 @@ from torch import Tensor
 from femoreg_torch.anatomy.tables import LARGEST_ID
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
+from femoreg_torch.volume.dicom import choose_series, is_dicom, read_series
 from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.itk import read_itk
+from femoreg_torch.volume.segments import has_names, read_segments
 
+_LEAST_INSIDE = 0.98  # of what a label map labels, less than this within the CT is told
 _FAT_HU, _BONE_HU = -50, 200  # every CT of a hip holds something below the first and something above the second
 
 
-def _read(path: Path) -> sitk.Image:
-    """The volume with its index axes turned to run closest to +L, +P, +S. Raises `InputError`."""
-    image = read_itk(path)
+def _read(path: Path, series: str | None = None) -> tuple[sitk.Image, tuple[str, ...]]:
+    """The stored volume, and what had to be done to it in words. Raises `InputError`."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder.")
+    sitk.ProcessObject.SetGlobalWarningDisplay(False)  # the reason of a failure comes with the exception
+    if path.is_dir() or is_dicom(path):
+        return read_series(choose_series(path, series))
+    return read_itk(path), ()
+
+
+def _oriented(image: sitk.Image, path: Path) -> sitk.Image:
+    """The volume with its index axes turned to run closest to +L, +P, +S. Raises `InputError`.
+
+    Index axes may form a left-handed set, as dcm2niix and FSL store them: the direction matrix says where left is, and
+    turning the axes makes them right-handed.
+    """
     if image.GetDimension() == 4 and image.GetSize()[3] == 1:
         image = image[:, :, :, 0]
     if image.GetDimension() != 3 or image.GetNumberOfComponentsPerPixel() != 1 or min(image.GetSize()) < 2:
@@ -26,11 +43,6 @@ def _read(path: Path) -> sitk.Image:
         raise InputError(
             f"{path}: a 3-D volume of one channel was expected, found {size} voxels of "
             f"{image.GetNumberOfComponentsPerPixel()} channel(s)."
-        )
-    if np.linalg.det(np.reshape(image.GetDirection(), (3, 3))) < 0:
-        raise InputError(
-            f"{path}: the direction matrix is mirrored (left-handed, determinant −1), so left and right cannot be told "
-            "apart for sure. Export the volume anew with right-handed axes."
         )
     return sitk.DICOMOrient(image, "LPS")
 
@@ -45,20 +57,34 @@ def _lps_from_index(image: sitk.Image) -> Tensor:
 def read_volume(path: Path) -> Volume:
     """Any volume as float32 (Z, Y, X) on its own grid, index axes closest to +L, +P, +S, exact affine (also oblique).
 
-    `path` is a NIfTI, NRRD or MHA file or the folder of one DICOM series. Raises `InputError` for what cannot be read,
-    is not 3-D, is mirrored, or holds values that are not finite.
+    `path` is a NIfTI, NRRD or MHA file, the folder of one DICOM series, or one of its files. Raises `InputError` for
+    what cannot be read, is not 3-D, or holds values that are not finite.
     """
-    image = _read(Path(path))
+    return read_volume_told(path)[0]
+
+
+def read_volume_told(path: Path, series: str | None = None) -> tuple[Volume, tuple[str, ...]]:
+    """As `read_volume`, and what had to be done to it in words.
+
+    `series` names one of several DICOM series: its number, its UID or a part of its description.
+    """
+    image, told = _read(Path(path), series)
+    image = _oriented(image, path)
     stored = sitk.GetArrayViewFromImage(image)
     data = torch.from_numpy(stored.astype(np.float32))
     if stored.dtype.kind == "f" and not torch.isfinite(data).all():
         raise InputError(f"{path}: holds values that are not finite (NaN or infinite). Repair or export it anew.")
-    return Volume(data, _lps_from_index(image))
+    return Volume(data, _lps_from_index(image)), told
 
 
 def read_ct(path: Path) -> Volume:
     """A CT in HU, as `read_volume` reads it. Raises `InputError` for what that refuses and for what is not in HU."""
-    volume = read_volume(path)
+    return read_ct_told(path)[0]
+
+
+def read_ct_told(path: Path, series: str | None = None) -> tuple[Volume, tuple[str, ...]]:
+    """As `read_ct`, and what had to be done to it in words; `series` as for `read_volume_told`."""
+    volume, told = read_volume_told(path, series)
     lowest, highest = (v.item() for v in volume.data.aminmax())
     if lowest == highest:
         raise InputError(f"{path}: every voxel is {lowest:g}; a CT in HU was expected.")
@@ -67,16 +93,22 @@ def read_ct(path: Path) -> Volume:
             f"{path}: values run from {lowest:g} to {highest:g}, but a CT in HU has air or fat (below {_FAT_HU}) and "
             f"bone (above {_BONE_HU}). Export it in Hounsfield units (rescale applied, no window, no attenuation)."
         )
-    return volume
+    return volume, told
 
 
 def read_label_map(path: Path) -> Volume:
     """A label map by itself, on its own grid, oriented as by `read_volume`.
 
-    Labels are uint8 where they fit, else int32. Raises `InputError` for what `read_volume` refuses, and for values that
-    are no whole numbers from 0 to 65535.
+    A volume, or a segmentation whose parts have names (`femoreg_torch.volume.segments`): a `.seg.nrrd` file of 3D
+    Slicer, a folder with a mask for each bone, or DICOM SEG. Labels are uint8 where they fit, else int32. Raises
+    `InputError` for what `read_volume` refuses, and for values that are no whole numbers from 0 to 65535.
     """
-    image = _read(Path(path))
+    return _label_map_told(Path(path), None)[0]
+
+
+def _label_map_told(path: Path, ids: Collection[int] | None) -> tuple[Volume, tuple[str, ...]]:
+    stored, told = read_segments(path, ids) if has_names(path) else (read_itk(path), ())
+    image = _oriented(stored, path)
     data = sitk.GetArrayViewFromImage(image)
     whole = data.dtype.kind in "iu" or (data == np.floor(data)).all()
     if not (data.min() >= 0 and data.max() <= LARGEST_ID and whole):
@@ -85,38 +117,59 @@ def read_label_map(path: Path) -> Volume:
             f"{data.max():g}. Export the segmentation as a label map."
         )
     labels = data.astype(np.uint8 if data.max() <= 255 else np.int32)
-    return Volume(torch.from_numpy(labels), _lps_from_index(image))
+    return Volume(torch.from_numpy(labels), _lps_from_index(image)), told
 
 
 def read_labels(path: Path, like: Volume) -> Volume:
-    """A label map (`read_label_map`) that lies on the grid of `like`. Raises `InputError` also if it does not."""
-    labels = read_label_map(path)
-    if labels.data.shape != like.data.shape:
-        found, expected = (" × ".join(str(n) for n in reversed(v.data.shape)) for v in (labels, like))
-        raise InputError(
-            f"{path}: the label map has {found} voxels, but the CT has {expected}. Resample it to the CT's grid."
+    """A label map (`read_label_map`) on the grid of `like`, by nearest neighbour if its own is another."""
+    return read_labels_told(path, like)[0]
+
+
+def read_labels_told(path: Path, like: Volume, ids: Collection[int] | None = None) -> tuple[Volume, tuple[str, ...]]:
+    """A label map on the grid of `like`, and what had to be done to it in words.
+
+    A map on another grid is resampled by nearest neighbour. Of a segmentation whose parts have names, only those with
+    the values `ids` are read; None: all. Raises `InputError` as `read_label_map` does, and for a map of which nothing
+    lies in the CT.
+    """
+    labels, told = _label_map_told(Path(path), ids)
+    if labels.data.shape == like.data.shape:
+        corners = torch.cartesian_prod(
+            *(torch.tensor([0.0, n - 1], dtype=torch.float64) for n in like.data.shape[::-1])
         )
-    last = (torch.tensor([0.0, n - 1], dtype=torch.float64) for n in reversed(like.data.shape))
-    corners = torch.cartesian_prod(*last)
-    shift = labels.lps_from_index - like.lps_from_index
-    apart = (corners @ shift[:3, :3].T + shift[:3, 3]).norm(dim=1).max().item()
-    if apart > 0.05 * min(like.spacing_mm):
+        shift = labels.lps_from_index - like.lps_from_index
+        apart = (corners @ shift[:3, :3].T + shift[:3, 3]).norm(dim=1).max().item()
+        if apart <= 0.05 * min(like.spacing_mm):
+            return Volume(labels.data, like.lps_from_index), told
+    grid = sitk.Resample(_image(labels), _image(like), sitk.Transform(), sitk.sitkNearestNeighbor, 0)
+    moved = Volume(torch.from_numpy(sitk.GetArrayFromImage(grid)), like.lps_from_index)
+    labelled = int(labels.data.count_nonzero()) * float(np.prod(labels.spacing_mm))
+    kept = int(moved.data.count_nonzero()) * float(np.prod(like.spacing_mm))
+    if labelled and not kept:
         raise InputError(
-            f"{path}: the label map lies on another grid than the CT (its corners are up to {apart:.3g} mm away). "
-            "Resample it to the CT's grid."
+            f"{path}: nothing of the label map lies in the CT. Check that both are of the same scan, and for RAS/LPS "
+            "mix-ups."
         )
-    return Volume(labels.data, like.lps_from_index)
+    spacing = " × ".join(f"{s:.3g}" for s in labels.spacing_mm)
+    note = f"the label map {path.name} has a grid of its own ({spacing} mm): it was resampled by nearest neighbour"
+    if kept < _LEAST_INSIDE * labelled:
+        note += f", and {1 - kept / labelled:.0%} of what it labels lies outside the CT"
+    return moved, (*told, note)
 
 
 def write_volume(path: Path, volume: Volume) -> None:
     """Write a volume; the suffix chooses the format (.nii.gz, .nrrd, .mha). HU (float) are stored as whole numbers."""
-    data = volume.data.numpy()
-    if data.dtype.kind == "f":
-        data = np.clip(np.rint(data), -32768, 32767).astype(np.int16)
-    image = sitk.GetImageFromArray(data)
+    if volume.data.dtype.is_floating_point:
+        volume = volume.with_data(volume.data.round().clamp(-32768, 32767).to(torch.int16))
+    image = _image(volume)
+    with temporary_file(Path(path)) as part:
+        sitk.WriteImage(image, str(part), useCompression=True)
+
+
+def _image(volume: Volume) -> sitk.Image:
+    image = sitk.GetImageFromArray(volume.data.numpy())
     spacing = np.array(volume.spacing_mm)
     image.SetSpacing(spacing.tolist())
     image.SetDirection((volume.lps_from_index[:3, :3].numpy() / spacing).ravel().tolist())
     image.SetOrigin(volume.lps_from_index[:3, 3].tolist())
-    with temporary_file(Path(path)) as part:
-        sitk.WriteImage(image, str(part), useCompression=True)
+    return image

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from femoreg_torch.case import Case, Result, new_folder, read_case
+from femoreg_torch.case import Case, Result, Start, new_folder, read_case
 from femoreg_torch.case.femoroplasty import DEVICE, FEMUR, PELVIS, with_device
 from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.files import plain
@@ -164,7 +164,7 @@ def _image_again(
     with new_folder(target) as folder:
         known = read_preoperative(patient, procedure.hip, body.device_seed, settings, folder / f"{DEVICE}.stl")
         known = copied(known, folder)
-        device = replace(known.device, camera1_from_device=moved.start[DEVICE])
+        device = replace(known.device, start=Start(camera1_from=moved.start[DEVICE]))
         known = replace(known, case=with_device(known.case, device), device=device)
         images = image_views(body, known, moved.drawn, settings, generator)
         write_told(folder, known, images, moved.drawn, condition.told, body.device_seed)

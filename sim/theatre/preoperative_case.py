@@ -19,7 +19,7 @@ from femoreg_torch.case.femoroplasty import (
     planned,
     with_device,
 )
-from femoreg_torch.case.model import Model, PlannedPath, Side
+from femoreg_torch.case.model import Model, PlannedPath, Side, Start
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import load_carm
@@ -119,7 +119,7 @@ def _write_device(seed: int, path: Path) -> Device:
     mesh, points = make_device(seed)
     with temporary_file(path) as part:
         mesh.export(part)
-    return Device(Model(path, None), points, torch.eye(4, dtype=torch.float64))
+    return Device(Model(path, None), points, Start(camera1_from=torch.eye(4, dtype=torch.float64)))
 
 
 def _at_nominal_pose(device: Device, path: PlannedPath, head: Tensor, side: Side, settings: Simulation) -> Device:
@@ -134,4 +134,4 @@ def _at_nominal_pose(device: Device, path: PlannedPath, head: Tensor, side: Side
     mesh = read_mesh(device.model.path)
     pose = nominal_device(mesh, device.points, path_camera, settings.acquisition.device_depth_mm)
     model = replace(device.model, hu=settings.acquisition.device_hu, material=None)
-    return replace(device, model=model, camera1_from_device=pose)
+    return replace(device, model=model, start=Start(camera1_from=pose))

@@ -63,7 +63,8 @@ def draw_procedure(
     femur_motion = settings.femur.draw(generator)
     camera1_from_femur = camera_from_pelvis[0] @ about_point(femur_motion, known.head)
 
-    nominal = known.device.camera1_from_device
+    nominal = known.device.start.camera1_from
+    assert nominal is not None  # `read_preoperative` put it there
     camera_from_camera1 = camera_from_pelvis @ invert_rigid(camera_from_pelvis[0])
     centre = transform_points(nominal, known.device.points["center"][None])[0]
     for _ in range(_TRIES):

@@ -11,7 +11,7 @@ import torch
 import yaml
 
 from femoreg_torch.anatomy import HIP, label_table
-from femoreg_torch.case import Case, Model, PlannedPath, View, read_case, write_case, write_json
+from femoreg_torch.case import Case, Model, PlannedPath, Start, View, read_case, write_case, write_json
 from femoreg_torch.case.femoroplasty import Device, device_of, femoroplasty_objects, planned, with_device
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import CArm, Uncertainty, centred_camera, exp_se3, load_carm, poses_by_object
@@ -30,7 +30,7 @@ def example(folder: Path) -> Case:
     points = torch.randn(18, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 100
     landmarks = dict(zip(HIP.landmark_names, points, strict=False))
     device_points = dict(zip(("tip", "base", "center"), points[15:], strict=True))
-    device = Device(Model(folder / "device.stl", 5000.0), device_points, pose(1))
+    device = Device(Model(folder / "device.stl", 5000.0), device_points, Start(camera1_from=pose(1)))
     return Case(
         folder=folder,
         carm=load_carm("cios_fusion"),

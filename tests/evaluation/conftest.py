@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from femoreg_torch.anatomy import HIP
-from femoreg_torch.case import Case, Model, ObjectQuality, Result, View, result_content, write_case, write_json
+from femoreg_torch.case import Case, Model, ObjectQuality, Result, Start, View, result_content, write_case, write_json
 from femoreg_torch.case.femoroplasty import Device, femoroplasty_objects, planned
 from femoreg_torch.fluoro import write_image
 from femoreg_torch.geometry import Camera, CArm, centred_camera, poses_by_object, rigid
@@ -60,7 +60,7 @@ def procedure(tmp_path: Path) -> tuple[Path, Path]:
             write_image(folder / name, noise.to(torch.uint16))
         views.append(View({"anatomy": folder / f"view{number}.tif", "device": folder / f"view{number}_device.tif"}))
     truth = poses_by_object(POSE.expand(3, 4, 4).clone(), "pelvis", {"femur": POSE.clone(), "device": nominal})
-    device = Device(Model(folder / "device.stl", 5000.0), points, nominal)
+    device = Device(Model(folder / "device.stl", 5000.0), points, Start(camera1_from=nominal))
     case = Case(
         folder=folder,
         carm=CArm(CAMERA, (0.0, 0.0, 620.0), (0.0, 1.0, 0.0)),

@@ -9,7 +9,7 @@ import torch
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
-from femoreg_torch.volume import Volume, axis_aligned, check_inside, read_landmarks, write_landmarks
+from femoreg_torch.volume import Volume, axis_aligned, check_inside, read_landmarks, read_path_points, write_landmarks
 
 HEAD, NOTCH = [97.3, -11.84, -78.18], [-78.68, 13.25, -23.23]  # FH-l is left (+x), GSN-r right, LPS
 RAS_HEAD, RAS_NOTCH = [-97.3, 11.84, -78.18], [78.68, -13.25, -23.23]
@@ -64,6 +64,55 @@ def test_all_formats_give_the_same_lps_points_in_the_same_order(tmp_path: Path, 
         assert torch.equal(found[key], point)
 
 
+def test_fcsv_without_a_header_is_ras_and_has_the_columns_of_slicer(tmp_path: Path) -> None:
+    rows = [line for line in fcsv("RAS", RAS_HEAD, RAS_NOTCH).splitlines() if not line.startswith("#")]
+    (tmp_path / "points.fcsv").write_text("\n".join(rows))
+    found = read_landmarks(tmp_path / "points.fcsv")
+    for key, point in expected().items():
+        assert torch.equal(found[key], point)
+
+
+def test_several_lists_each_in_its_own_space_and_names_spelt_otherwise(tmp_path: Path) -> None:
+    first = slicer("LPS", HEAD, NOTCH, controlPoints=[{"label": "fh_L", "position": HEAD}])
+    second = slicer("RAS", HEAD, NOTCH, controlPoints=[{"label": "GSN R", "position": RAS_NOTCH}])
+    content = {"markups": first["markups"] + second["markups"]}
+    (tmp_path / "points.mrk.json").write_text(json.dumps(content))
+    found = read_landmarks(tmp_path / "points.mrk.json")
+    assert list(found) == ["FH-l", "GSN-r"]
+    for key, point in expected().items():
+        assert torch.equal(found[key], point)
+
+
+def path_file(folder: Path, names: list[str], **changes: Any) -> Path:
+    points = [{"label": name, "position": [10.0 * n, 1, 2]} for n, name in enumerate(names, 1)]
+    path = folder / "plan.mrk.json"
+    path.write_text(json.dumps(slicer("LPS", HEAD, NOTCH, controlPoints=points, **changes)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("names", "entry", "target"),
+    [
+        (["L-1", "L-2"], 10, 20),  # the ends of a line
+        (["", ""], 10, 20),
+        (["Target", "Entry point"], 20, 10),
+        (["FH-l", "entry", "target"], 20, 30),
+        (["F-1"], 10, None),
+        (["entry", "F-2"], 10, None),
+    ],
+)
+def test_the_ends_of_a_planned_path(tmp_path: Path, names: list[str], entry: float, target: float | None) -> None:
+    found, end = read_path_points(path_file(tmp_path, names, type="Line"))
+    assert found.tolist() == [entry, 1, 2]
+    assert (None if end is None else end.tolist()) == (None if target is None else [target, 1, 2])
+
+
+@pytest.mark.parametrize("names", [["a", "b", "c"], ["target"], ["entry", "entry 2"], []])
+def test_points_that_are_no_path(tmp_path: Path, names: list[str]) -> None:
+    with pytest.raises(InputError, match="a line, or points named `entry` and `target`, were expected"):
+        read_path_points(path_file(tmp_path, names))
+
+
 @pytest.mark.parametrize("name", ["points.json", "points.mrk.json"])
 def test_written_landmarks_come_back(tmp_path: Path, name: str) -> None:
     values = torch.randn(14, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
@@ -114,7 +163,6 @@ def test_bad_files(tmp_path: Path, kind: str) -> None:
     ("change", "message"),
     [
         (("# CoordinateSystem = LPS", "# CoordinateSystem = 2"), "LPS or RAS, found '2'"),
-        (("# CoordinateSystem = LPS\n", ""), "LPS or RAS, found None"),
         (("97.3", "left"), "FH-l: three finite numbers"),
         (("0,FH-l,,", "0,Head,,"), "unknown landmark 'Head'"),
     ],

@@ -20,6 +20,7 @@ from femoreg_torch.volume import (
     read_ct,
     read_label_map,
     read_labels,
+    read_labels_told,
     read_landmarks,
     read_volume,
     structure_attenuation,
@@ -27,18 +28,20 @@ from femoreg_torch.volume import (
 )
 
 OBLIQUE = Rotation.from_euler("xyz", [12, -8, 20], degrees=True).as_matrix()
-RIGHT_HANDED = {
+DIRECTIONS = {
     "LPS": np.eye(3),
     "RAS": np.diag([-1.0, -1.0, 1.0]),
     "RPI": np.diag([-1.0, 1.0, -1.0]),
     "sagittal": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
     "oblique": OBLIQUE,
     "oblique RAS": OBLIQUE @ np.diag([-1.0, -1.0, 1.0]),
+    "left-handed": np.diag([1.0, -1.0, 1.0]),  # as dcm2niix and FSL store an axial CT
+    "oblique left-handed": OBLIQUE @ np.diag([1.0, -1.0, 1.0]),
 }
 BRIGHT = (2, 5, 4)  # x, y, z index of the one bright voxel
 
 
-def ct_image(direction: np.ndarray = RIGHT_HANDED["LPS"], dtype: type = np.int16) -> sitk.Image:
+def ct_image(direction: np.ndarray = DIRECTIONS["LPS"], dtype: type = np.int16) -> sitk.Image:
     """A CT of air (8 × 9 × 7 voxels) with one voxel of bone."""
     array = np.full((7, 9, 8), -1000, dtype)
     array[BRIGHT[::-1]] = 1200
@@ -54,7 +57,7 @@ def brightest_point(volume: Volume) -> np.ndarray:
     return (volume.lps_from_index @ torch.tensor([x, y, z, 1.0], dtype=torch.float64))[:3].numpy()
 
 
-@pytest.mark.parametrize("direction", RIGHT_HANDED.values(), ids=RIGHT_HANDED.keys())
+@pytest.mark.parametrize("direction", DIRECTIONS.values(), ids=DIRECTIONS.keys())
 @pytest.mark.parametrize("suffix", [".nii.gz", ".mha", ".nrrd"])
 def test_every_index_order_ends_in_lps_with_its_points_in_place(
     tmp_path: Path, direction: np.ndarray, suffix: str
@@ -66,6 +69,48 @@ def test_every_index_order_ends_in_lps_with_its_points_in_place(
     np.testing.assert_allclose(brightest_point(volume), image.TransformIndexToPhysicalPoint(BRIGHT), atol=1e-5)
     cosines = volume.lps_from_index[:3, :3] / torch.tensor(volume.spacing_mm)
     assert (cosines.diagonal() > 0.8).all()  # index axes run along +L, +P, +S
+
+
+def big_endian(folder: Path, suffix: str, image: sitk.Image) -> Path:
+    """The image as a raw file whose numbers have their high bytes first, header written by hand."""
+    values = sitk.GetArrayFromImage(image).astype(">i2")
+    path, origin = folder / f"ct{suffix}", image.GetOrigin()
+    columns = np.reshape(image.GetDirection(), (3, 3)).T
+    if suffix == ".nii":
+        affine = np.eye(4)
+        affine[:3, :3], affine[:3, 3] = (columns.T * image.GetSpacing()), origin
+        header = nibabel.Nifti1Header(endianness=">")
+        header.set_data_dtype(">i2")
+        flip = np.diag([-1.0, -1, 1, 1])
+        nibabel.save(nibabel.Nifti1Image(values.transpose(2, 1, 0), flip @ affine, header), path)
+        return path
+    if suffix == ".nrrd":
+        vectors = " ".join(
+            f"({','.join(f'{v:.17g}' for v in axis * s)})" for axis, s in zip(columns, image.GetSpacing(), strict=True)
+        )
+        head = (
+            f"NRRD0004\ntype: int16\ndimension: 3\nspace: left-posterior-superior\nsizes: 8 9 7\nencoding: raw\n"
+            f"endian: big\nspace directions: {vectors}\nspace origin: ({','.join(map(str, origin))})\n\n"
+        )
+    else:
+        head = (
+            f"ObjectType = Image\nNDims = 3\nBinaryData = True\nBinaryDataByteOrderMSB = True\n"
+            f"TransformMatrix = {' '.join(f'{v:.17g}' for v in columns.ravel())}\n"
+            f"Offset = {' '.join(map(str, origin))}\n"
+            f"ElementSpacing = {' '.join(map(str, image.GetSpacing()))}\nDimSize = 8 9 7\n"
+            "ElementType = MET_SHORT\nElementDataFile = LOCAL\n"
+        )
+    path.write_bytes(head.encode() + values.tobytes())
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nrrd", ".mha"])
+@pytest.mark.parametrize("direction", ["oblique", "oblique left-handed"])
+def test_big_endian_files(tmp_path: Path, suffix: str, direction: str) -> None:
+    image = ct_image(DIRECTIONS[direction])
+    volume = read_ct(big_endian(tmp_path, suffix, image))
+    assert volume.data.aminmax() == (-1000, 1200)
+    np.testing.assert_allclose(brightest_point(volume), image.TransformIndexToPhysicalPoint(BRIGHT), atol=1e-4)
 
 
 @pytest.mark.parametrize("dtype", [np.int32, np.float32, np.int16])
@@ -125,8 +170,6 @@ def damaged(kind: str, folder: Path) -> Path:
         path.write_text("not an image")
     elif kind == "flat":
         sitk.WriteImage(image[:, :, 2], str(path))
-    elif kind == "mirrored":
-        sitk.WriteImage(ct_image(np.diag([1.0, -1.0, 1.0])), str(path))
     elif kind == "nan":
         array = sitk.GetArrayFromImage(ct_image(dtype=np.float32))
         array[0, 0, 0] = np.nan
@@ -155,7 +198,6 @@ def damaged(kind: str, folder: Path) -> Path:
         ("missing", "no such file"),
         ("text", "cannot be read"),
         ("flat", "3-D volume"),
-        ("mirrored", "mirrored"),
         ("nan", "not finite"),
         ("constant", "every voxel is 3"),
         ("attenuation", "Hounsfield"),
@@ -241,7 +283,7 @@ def test_finite_floats_and_nifti_2(tmp_path: Path) -> None:
         read_ct(tmp_path / "ct2.nii.gz")
 
 
-def label_image(direction: np.ndarray = RIGHT_HANDED["LPS"]) -> sitk.Image:
+def label_image(direction: np.ndarray = DIRECTIONS["LPS"]) -> sitk.Image:
     return sitk.Cast(ct_image(direction) > 0, sitk.sitkUInt8) * 5
 
 
@@ -279,12 +321,8 @@ def test_labels_up_to_65535_are_read_and_found(tmp_path: Path, suffix: str, dtyp
 
 def wrong_labels(kind: str) -> sitk.Image:
     labels = label_image()
-    if kind == "shape":
-        return labels[1:, :, :]
-    if kind == "shifted":
-        labels.SetOrigin((-40.0 + 0.4, 13.0, 200.0))
-    if kind == "turned":
-        labels.SetDirection(Rotation.from_euler("z", 1, degrees=True).as_matrix().ravel().tolist())
+    if kind == "elsewhere":
+        labels.SetOrigin((40.0, -13.0, 200.0))
     if kind == "fractions":
         return sitk.Cast(labels, sitk.sitkFloat32) * 0.9
     if kind == "negative":
@@ -297,9 +335,7 @@ def wrong_labels(kind: str) -> sitk.Image:
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        ("shape", r"7 × 9 × 7 voxels, but the CT has 8 × 9 × 7"),
-        ("shifted", "another grid"),
-        ("turned", "another grid"),
+        ("elsewhere", "nothing of the label map lies in the CT"),
         ("fractions", "whole numbers"),
         ("negative", "whole numbers"),
         ("too large", "whole numbers from 0 to 65535 was expected, found 0 to 65540"),
@@ -310,6 +346,35 @@ def test_bad_labels(tmp_path: Path, kind: str, message: str) -> None:
     sitk.WriteImage(wrong_labels(kind), str(tmp_path / "labels.nii.gz"))
     with pytest.raises(InputError, match=message):
         read_labels(tmp_path / "labels.nii.gz", read_ct(tmp_path / "ct.nii.gz"))
+
+
+@pytest.mark.parametrize("kind", ["cropped", "coarser", "turned"])
+def test_a_label_map_on_another_grid_is_resampled_by_nearest_neighbour(tmp_path: Path, kind: str) -> None:
+    """Against SimpleITK's own values at the centres of the CT's voxels."""
+    sitk.WriteImage(ct_image(OBLIQUE), str(tmp_path / "ct.nii.gz"))
+    values = np.random.default_rng(2).integers(0, 6, (7, 9, 8)).astype(np.uint8)
+    labels = sitk.GetImageFromArray(values)
+    labels.CopyInformation(ct_image(OBLIQUE))
+    if kind == "cropped":
+        labels = labels[1:7, 2:, :6]
+    elif kind == "coarser":
+        labels.SetSpacing((1.7, 1.9, 4.0))
+    else:
+        labels.SetDirection((Rotation.from_euler("z", 30, degrees=True).as_matrix() @ OBLIQUE).ravel().tolist())
+    sitk.WriteImage(labels, str(tmp_path / "labels.nrrd"))
+    ct = read_ct(tmp_path / "ct.nii.gz")
+    found, told = read_labels_told(tmp_path / "labels.nrrd", ct)
+    assert found.lps_from_index is ct.lps_from_index
+    for z, y, x in np.ndindex(*found.data.shape):
+        point = (ct.lps_from_index @ torch.tensor([x, y, z, 1.0], dtype=torch.float64))[:3].tolist()
+        index = np.array(labels.TransformPhysicalPointToContinuousIndex(point))
+        if abs(index - np.floor(index) - 0.5).min() < 1e-4:
+            continue  # half-way between two voxels, either is right
+        inside = ((index > -0.5) & (index < np.array(labels.GetSize()) - 0.5)).all()
+        nearest = np.rint(index).astype(int).tolist()
+        assert found.data[z, y, x] == (labels[nearest] if inside else 0)
+    assert "labels.nrrd has a grid of its own" in told[0]
+    assert "resampled by nearest neighbour" in told[0]
 
 
 @pytest.mark.parametrize("suffix", [".nii.gz", ".mha", ".nrrd"])

@@ -70,7 +70,7 @@ def test_a_bare_folder_becomes_a_planned_case_with_a_device(folder):
     assert case.views == ()
     assert case.truth is None
     guide = transform_points(
-        known.device.camera1_from_device, torch.stack([known.device.points[k] for k in ("base", "tip")])
+        known.device.start.camera1_from, torch.stack([known.device.points[k] for k in ("base", "tip")])
     )
     path = nominal_ap(HEAD, "left", settings.acquisition)[:3, :3] @ (case.plan.target - case.plan.entry_point)
     assert ((guide[1] - guide[0]) @ path) > 0

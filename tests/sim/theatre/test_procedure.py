@@ -14,7 +14,7 @@ from torch.testing import assert_close
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.case import Case
 from femoreg_torch.case.femoroplasty import Device, femoroplasty_objects, planned
-from femoreg_torch.case.model import Model
+from femoreg_torch.case.model import Model, Start
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import attenuation_image
 from femoreg_torch.geometry import invert_rigid, load_carm, log_se3, project_points, rotation_angle, transform_points
@@ -56,7 +56,7 @@ def known(mesh, settings):
     entry = HEAD + torch.tensor([45.0, 20, -40], dtype=torch.float64)
     ap = nominal_ap(HEAD, "left", settings.acquisition)
     pose = nominal_device(mesh, points, ap[:3, :3] @ (HEAD - entry), settings.acquisition.device_depth_mm)
-    device = Device(Model(Path("device.stl"), 5000.0), points, pose)
+    device = Device(Model(Path("device.stl"), 5000.0), points, Start(camera1_from=pose))
     case = Case(
         folder=Path(),
         carm=replace(carm, camera=carm.camera.downsampled(8)),
@@ -144,7 +144,7 @@ def test_draws_stay_within_the_ranges_of_the_paper(known, mesh, settings):
         assert (transform_points(first, HEAD[None]) - transform_points(ap, HEAD[None])).norm() < 30
         femur = invert_rigid(first) @ procedure.camera1_from_femur
         assert math.degrees(rotation_angle(femur[:3, :3])) <= 15
-        device = invert_rigid(known.device.camera1_from_device) @ procedure.camera_from_device[0]
+        device = invert_rigid(known.device.start.camera1_from) @ procedure.camera_from_device[0]
         assert math.degrees(rotation_angle(device[:3, :3])) <= 5
         relative = procedure.camera_from_pelvis[1:] @ invert_rigid(first)
         orbits.append(torch.rad2deg(log_se3(relative)[:, 1]))
@@ -167,7 +167,7 @@ def test_the_nominal_view_is_head_up_with_the_left_hip_on_the_right(settings):
 def test_the_guide_points_along_the_image_of_the_path(known, mesh, settings):
     ap = nominal_ap(HEAD, "left", settings.acquisition)
     path = ap[:3, :3] @ (known.case.plan.target - known.case.plan.entry_point)
-    guide = known.device.camera1_from_device[:3, 2]
+    guide = known.device.start.camera1_from[:3, 2]
     assert guide[2].item() == pytest.approx(0, abs=1e-9)
     assert (guide[:2] / guide[:2].norm() @ (path[:2] / path[:2].norm())).item() == pytest.approx(1)
 

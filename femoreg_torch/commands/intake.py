@@ -1,0 +1,181 @@
+"""`femoreg inspect`, `femoreg check` and `femoreg new-case`: a user's own data."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from femoreg_torch.intake.planes import Picture
+
+
+def inspect(path: Path, *, out: Path = Path("inspect.png"), series: str | None = None) -> None:
+    """Say what a file or folder holds, and what may be wrong with it, and show it in a picture.
+
+    Knows: CTs and label maps (DICOM folder, NIfTI, NRRD, MHA), segmentations of 3D Slicer (.seg.nrrd), folders with a
+    mask for each bone (TotalSegmentator), DICOM SEG; landmarks and other points (.mrk.json, .fcsv, .json), meshes,
+    transforms (.tfm, .h5), images, and case folders. A volume is shown in three planes.
+
+    Args:
+        path: File or folder.
+        out: Picture to write (PNG), where there is something to be shown.
+        series: Of a DICOM folder with several series, the number, UID or a part of the description of one.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+
+    from femoreg_torch.intake import inspect_path
+
+    console = Console(soft_wrap=True)
+    found = inspect_path(path, series)
+    console.print(f"[bold]{escape(str(path))}[/]: {escape(found.kind)}")
+    for fact in found.facts:
+        console.print(f"  {escape(fact)}", highlight=False)
+    for warning in found.warnings:
+        console.print(f"[yellow]Warning:[/] {escape(warning)}.", highlight=False)
+    if found.picture is not None:
+        _write_picture(out, found.picture)
+        console.print(f"Picture: {escape(str(out))}")
+
+
+def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None = None, fast: bool = False) -> int:
+    """List everything that is wrong with a case, at once, and draw how it was understood.
+
+    The picture shows three planes of the CT with bones and landmarks, and the first view with the bones at the start
+    pose, sides named, and with the device where it is meant to stand. Ends with status 1 if something is wrong.
+
+    Args:
+        case: Case folder with case.yaml.
+        out: Picture to write (PNG).
+        landmarks: Landmarks in the first image, in place of the network's: see `femoreg register --help`.
+        fast: Do not look for the start pose in the images.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+
+    from femoreg_torch.case.start_files import read_pixels
+    from femoreg_torch.commands.status import AMISS, DONE
+    from femoreg_torch.intake import check_case
+
+    console = Console(soft_wrap=True)
+    pixels = None if landmarks is None else read_pixels(landmarks)
+    found = check_case(case, find_start=not fast, landmarks=pixels)
+    for fact in found.facts:
+        console.print(f"  {escape(fact)}", highlight=False)
+    for warning in found.warnings:
+        console.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False)
+    for number, problem in enumerate(found.problems, 1):
+        console.print(f"[bold red]{number}.[/] {escape(problem)}", highlight=False)
+    if found.picture is not None:
+        _write_picture(out, found.picture)
+        console.print(f"Picture: {escape(str(out))}")
+    if found.problems:
+        count = len(found.problems)
+        console.print(f"[bold red]{count} problem{'s' * (count > 1)}.[/] Mend all and check again.")
+        return AMISS
+    console.print("[green]Nothing is wrong that can be seen before the registration.[/]")
+    return DONE
+
+
+def _write_picture(path: Path, picture: "Picture") -> None:
+    import cv2
+
+    from femoreg_torch.errors import InputError
+    from femoreg_torch.files import temporary_file
+
+    if path.suffix.lower() not in (".png", ".jpg"):
+        raise InputError(f"{path}: a name that ends in .png was expected. Choose another with --out.")
+    with temporary_file(path) as part:
+        cv2.imwrite(str(part), picture)
+
+
+def new_case(
+    out: Path,
+    *,
+    ct: Path | None = None,
+    series: str | None = None,
+    labels: Path | None = None,
+    bones: str | None = None,
+    landmarks: Path | None = None,
+    plan: Path | None = None,
+    side: Literal["left", "right"] | None = None,
+    device: Path | None = None,
+    device_points: Path | None = None,
+    material: str | None = None,
+    hu: float | None = None,
+    guide: str | None = None,
+    before_entry_mm: float = 0.0,
+    turned_deg: float = 0.0,
+    in_front_mm: float = 0.0,
+    device_transform: Path | None = None,
+    images: tuple[Path, ...] = (),
+    device_images: tuple[Path, ...] = (),
+    carm: str | None = None,
+    intensity: Literal["raw", "log"] = "raw",
+) -> None:
+    """Make a case folder of a CT, a segmentation, landmarks, a plan, a device and fluoroscopic images.
+
+    Files are taken as scanner, 3D Slicer or TotalSegmentator leave them. What is needed and not given is asked for, if
+    this runs in a terminal. The folder appears whole and checked (as by `femoreg check --fast`) or not at all;
+    everything that is wrong is told at once. Files are copied; a DICOM CT becomes ct.nii.gz.
+
+    Args:
+        out: Case folder to make.
+        ct: CT: folder of a DICOM series, or a NIfTI, NRRD or MHA file.
+        series: Which of several DICOM series: its number, UID, or a part of its description.
+        labels: Segmentation: label map, .seg.nrrd of 3D Slicer, folder with a mask for each bone, or DICOM SEG.
+        bones: Label table of the map (totalsegmentator_v2, femoreg, …, or a YAML file), if its parts have no names.
+        landmarks: Landmarks of the CT: 3D Slicer markups (.mrk.json, .fcsv) or JSON; at least four, with the operated
+            femoral head (FH).
+        plan: Planned path: a line of 3D Slicer, or points `entry` and `target`; without a target, the femoral head.
+        side: Operated side; by default that of the femur which the entry point lies on.
+        device: CAD model (STL, PLY, OBJ, 3MF, GLB), mm, or none.
+        device_points: Its points tip, base and center, in its own space: 3D Slicer markups or JSON. Without `center` it
+            is the middle of its box.
+        material: What the device is made of: steel, titanium, cobalt chromium, aluminium, peek or pmma.
+        hu: HU of the device, in place of a material; 5000 if neither is given.
+        guide: Which way the guide points at its nominal pose: `along the planned path` (the default), `from the side`,
+            `from the front`, `from the back`, `from above`, `from below` or `from the middle`.
+        before_entry_mm: How far before the entry point its tip stands; negative: past it.
+        turned_deg: By how much it is turned about the guide, by the right-hand rule about base → tip.
+        in_front_mm: How far all of it stands in front of that place, towards the front of the patient.
+        device_transform: In place of these: a transform of 3D Slicer under which the device stands right in the CT.
+        images: Images without the device, one for each C-arm pose, in order; or a folder of them.
+        device_images: Images with the device, in the same order; or a folder of them.
+        carm: C-arm: a preset (cios_fusion) or a YAML file; by default what the tags of the first DICOM image say.
+        intensity: raw (bone dark) or log (attenuation, bone bright).
+    """
+    import sys
+
+    from rich.console import Console
+    from rich.markup import escape
+
+    from femoreg_torch.commands.asking import ask_for_missing
+    from femoreg_torch.intake import NewCase, make_case
+
+    given = NewCase(
+        ct=ct,
+        series=series,
+        labels=labels,
+        bones=bones,
+        landmarks=landmarks,
+        plan=plan,
+        side=side,
+        device=device,
+        device_points=device_points,
+        material=material,
+        hu=hu,
+        guide=guide,
+        before_entry_mm=before_entry_mm,
+        turned_deg=turned_deg,
+        in_front_mm=in_front_mm,
+        device_transform=device_transform,
+        images=tuple(images),
+        device_images=tuple(device_images),
+        carm=carm,
+        intensity=intensity,
+    )
+    console = Console(soft_wrap=True)
+    if sys.stdin.isatty():
+        given = ask_for_missing(given, console)
+    for note in make_case(out, given):
+        console.print(f"  {escape(note)}", highlight=False)
+    console.print(f"Case written to {escape(str(out))}. Look at it with `femoreg check`, then `femoreg register`.")

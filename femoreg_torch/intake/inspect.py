@@ -1,0 +1,250 @@
+"""What a file or folder holds, in words and as a picture: `femoreg inspect`."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from femoreg_torch.anatomy import HIP, bone_of_name
+from femoreg_torch.case import read_case
+from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import read_image
+from femoreg_torch.geometry import read_itk_transform
+from femoreg_torch.intake.planes import Picture, three_planes
+from femoreg_torch.intake.volumes import (
+    ct_warnings,
+    cut_bones,
+    described,
+    fitting_tables,
+    looks_like_labels,
+    nifti_warnings,
+)
+from femoreg_torch.volume import (
+    Volume,
+    has_names,
+    is_in_ras,
+    read_label_map,
+    read_landmarks,
+    read_mesh,
+    read_volume_told,
+    segment_names,
+)
+from femoreg_torch.volume.dicom import is_dicom, series_in
+from femoreg_torch.volume.mesh_files import bounds_of
+from femoreg_torch.volume.segments import SEGMENTATION_SUFFIX
+
+_VOLUMES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".hdr")
+_MESHES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb", ".step", ".stp")
+_POINTS = (".fcsv", ".json")
+_TRANSFORMS = (".tfm", ".h5", ".mat")
+_PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+_TINTS = (
+    (255, 90, 60),
+    (60, 160, 255),
+    (240, 220, 60),
+    (180, 90, 220),
+    (60, 220, 160),
+    (255, 150, 210),
+    (150, 230, 90),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What something is, facts and warnings in words, and a picture (H, W, 3), blue, green, red, if there is one."""
+
+    kind: str
+    facts: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    picture: Picture | None = None
+
+
+def inspect_path(path: Path, series: str | None = None) -> Findings:
+    """What a file or a folder is; `series` chooses among several DICOM series. Raises `InputError`."""
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder.")
+    if path.is_dir():
+        return _folder(path, series)
+    name = path.name.lower()
+    kinds: tuple[tuple[tuple[str, ...], Callable[[Path], Findings]], ...] = (
+        ((SEGMENTATION_SUFFIX,), _segmentation),
+        (_VOLUMES, _volume),
+        (_POINTS, _points),
+        (_MESHES, _mesh),
+        (_TRANSFORMS, _transform),
+        (_PICTURES, _image),
+    )
+    for suffixes, look in kinds:
+        if name.endswith(suffixes):
+            return look(path)
+    if is_dicom(path):
+        return _dicom_file(path)
+    raise InputError(
+        f"{path}: nothing that is known here. CTs, label maps, landmarks, meshes, transforms, images, cases are."
+    )
+
+
+def _folder(path: Path, series: str | None) -> Findings:
+    if (path / "case.yaml").is_file():
+        return _case(path)
+    if any(entry.name.lower().endswith(_VOLUMES) for entry in path.iterdir()):
+        return _segmentation(path)
+    there = series_in(path)
+    if not there:
+        raise InputError(f"{path}: holds no case.yaml, no DICOM files and no masks of bones.")
+    facts = [one.told for one in there]
+    volumes = [one for one in there if one.may_be_volume]
+    if series is None and len(volumes) != 1:
+        if len(there) == 1 and there[0].modality == "SEG":
+            return _segmentation(path)
+        hint = "choose one with --series" if volumes else "none of them is a volume; give one file to see an image"
+        return Findings("DICOM folder", (*facts, hint))
+    found = _volume(path, series)
+    return Findings("DICOM folder", (*facts, *found.facts), found.warnings, found.picture)
+
+
+def _dicom_file(path: Path) -> Findings:
+    import pydicom
+
+    header = pydicom.dcmread(path, stop_before_pixels=True, force=True)
+    if header.get("Modality") == "SEG":
+        return _segmentation(path)
+    if header.get("Modality") == "CT":
+        found = _volume(path)
+        return Findings(f"slice of a {found.kind}", found.facts, found.warnings, found.picture)
+    words = []
+    for tag, told in (
+        ("Modality", "modality"),
+        ("DistanceSourceToDetector", "source to detector, mm"),
+        ("ImagerPixelSpacing", "pixel spacing on the detector, mm"),
+        ("PixelSpacing", "pixel spacing, mm"),
+        ("PositionerPrimaryAngle", "primary angle, °"),
+        ("PositionerSecondaryAngle", "secondary angle, °"),
+        ("PhotometricInterpretation", "photometric interpretation"),
+        ("NumberOfFrames", "frames"),
+    ):
+        words.append(f"{told}: {header[tag].value}" if tag in header else f"{told}: not told")
+    found = _image(path)
+    return Findings("DICOM image", (*found.facts, *words), found.warnings, found.picture)
+
+
+def _volume(path: Path, series: str | None = None) -> Findings:
+    volume, told = read_volume_told(path, series)
+    warnings = [*told, *nifti_warnings(path)]
+    if looks_like_labels(volume):
+        return _labels(volume, {}, path, warnings)
+    low, high = (float(v) for v in volume.data.aminmax())
+    facts = (described(volume), f"values from {low:g} to {high:g}")
+    return Findings("CT", facts, (*warnings, *ct_warnings(volume)), three_planes(volume, None, {}, {}))
+
+
+def _segmentation(path: Path) -> Findings:
+    assert has_names(path)
+    return _labels(read_label_map(path), segment_names(path), path, [])
+
+
+def _labels(volume: Volume, names: Mapping[str, tuple[int, ...]], path: Path, warnings: list[str]) -> Findings:
+    data = volume.data.to(torch.int32)
+    counts = torch.bincount(data.flatten())
+    ids = [n for n in counts.nonzero()[:, 0].tolist() if n]
+    ml = float(np.prod(volume.spacing_mm)) / 1000
+    name_of = {n: name for name, of in names.items() for n in of}
+    listed = [f"{n}{f' {name_of[n]}' if n in name_of else ''} ({float(counts[n]) * ml:.0f} ml)" for n in ids]
+    facts = [described(volume), f"labels: {', '.join(listed[:40])}{', …' if len(listed) > 40 else ''}"]
+    table = {bone: n for n, name in name_of.items() if n in ids and (bone := bone_of_name(HIP, name))}
+    if names:
+        facts.append(f"bones by name: {', '.join(table) or 'none'}")
+        if empty := [name for name, of in names.items() if not set(of) & set(ids)]:
+            warnings.append(f"empty: {', '.join(empty)[:200]}")
+        if not table:
+            warnings.append(f"no part is named after a bone; known names are, say, {', '.join(HIP.bone_names)}")
+    else:
+        fitting = fitting_tables(ids)
+        facts.append(f"shipped tables whose ids are all there: {', '.join(fitting) or 'none'}")
+    whole = Volume(data, volume.lps_from_index)
+    warnings += cut_bones(whole, table, list(table))
+    tints = {n: HIP.bone(b).colour for b, n in table.items() if b in HIP.bone_names}
+    colours = {n: tints.get(n, _TINTS[k % len(_TINTS)]) for k, n in enumerate(ids)}
+    return Findings("label map", tuple(facts), tuple(warnings), three_planes(None, whole, colours, {}))
+
+
+def _points(path: Path) -> Findings:
+    points = read_landmarks(path, None)
+    facts = [f"{name}: ({', '.join(f'{v:.2f}' for v in point.tolist())}) mm LPS" for name, point in points.items()]
+    warnings: list[str] = []
+    try:
+        marks = read_landmarks(path)
+    except InputError as error:
+        warnings.append(f"not a file of landmarks alone: {error}")
+        return Findings("points", tuple(facts), tuple(warnings))
+    missing = [name for name in HIP.landmark_names if name not in marks]
+    if missing:
+        facts.append(f"without {', '.join(missing)}")
+    return Findings("landmarks of the hip", tuple(facts), tuple(_sides_of(marks)))
+
+
+def _sides_of(marks: Mapping[str, Tensor]) -> list[str]:
+    """In words, whether left landmarks lie to the right of right ones."""
+    pairs = [(name, f"{name[:-1]}r") for name in marks if name.endswith("-l") and f"{name[:-1]}r" in marks]
+    wrong = [left for left, right in pairs if marks[left][0] < marks[right][0]]
+    if not wrong:
+        return []
+    return [f"{', '.join(wrong)} lie to the right of their partners: sides are swapped, or RAS and LPS mixed up"]
+
+
+def _mesh(path: Path) -> Findings:
+    mesh = read_mesh(path)
+    low, high = mesh.bounds
+    facts = (
+        f"{len(mesh.faces)} triangles, closed, {abs(float(mesh.volume)) / 1000:.2f} ml",
+        f"from ({', '.join(f'{v:.1f}' for v in low)}) to ({', '.join(f'{v:.1f}' for v in high)}) mm",
+    )
+    warnings = []
+    if is_in_ras(path):
+        warnings.append("the file says RAS: 3D Slicer shows it turned against its coordinates. Export it anew as LPS")
+    try:
+        bounds_of([mesh], str(path))
+    except InputError as error:
+        warnings.append(str(error).rstrip("."))
+    return Findings("mesh", facts, tuple(warnings))
+
+
+def _transform(path: Path) -> Findings:
+    pose = read_itk_transform(path)
+    rows = [" ".join(f"{value:12.6f}" for value in row) for row in pose.tolist()]
+    said = "takes points of a model to where 3D Slicer shows it under this transform, LPS mm:"
+    return Findings("rigid transform of ITK or 3D Slicer", (said, *rows))
+
+
+def _image(path: Path) -> Findings:
+    image = read_image(path)
+    low, high = (float(v) for v in image.aminmax())
+    facts = (f"{image.shape[1]} × {image.shape[0]} pixels, values from {low:g} to {high:g}",)
+    warnings = []
+    if len(image.unique()) <= 256:
+        warnings.append(
+            "at most 256 grey values: a picture made for a screen, whose logarithm may not be a line integral"
+        )
+    grey = ((image - low) / (high - low) * 255).numpy().astype(np.uint8)
+    shrink = min(1.0, 768 / max(grey.shape))
+    picture = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    return Findings("image", facts, tuple(warnings), np.repeat(picture[..., None], 3, 2))
+
+
+def _case(path: Path) -> Findings:
+    case = read_case(path)
+    objects = ", ".join(case.objects)
+    kinds = [", ".join(f"{kind}: {image.name}" for kind, image in view.images.items()) for view in case.views]
+    facts = [
+        f"{case.template or 'objects written out'}{f', operated side: {case.side}' if case.side else ''}",
+        f"objects: {objects}",
+        f"{len(case.landmarks)} landmarks, bones: {', '.join(case.bones) or 'none'}",
+        *(f"view {number}: {told}" for number, told in enumerate(kinds, 1)),
+        "`femoreg check` lists what is wrong with it",
+    ]
+    return Findings("case", tuple(facts))

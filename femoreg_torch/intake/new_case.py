@@ -1,0 +1,326 @@
+"""A case folder made of the files that scanner, 3D Slicer, TotalSegmentator and C-arm leave: `femoreg new-case`."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+import yaml
+from torch import Tensor
+
+from femoreg_torch.anatomy import HIP, LabelTable, bone_of_name, label_table, label_table_names
+from femoreg_torch.case.femoroplasty import DEVICE, DEVICE_POINTS, FEMUR, TEMPLATE, femoral_head, operated_femur
+from femoreg_torch.case.model import Intensity, Side
+from femoreg_torch.case.nominal import ALONG_PATH, NominalPlace
+from femoreg_torch.case.reading import VERSIONS
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import new_folder, plain, write_text
+from femoreg_torch.geometry import read_itk_transform
+from femoreg_torch.intake.check import check_case
+from femoreg_torch.intake.volumes import fitting_tables
+from femoreg_torch.volume import (
+    Volume,
+    bone_labels,
+    has_names,
+    is_in_ras,
+    read_ct_told,
+    read_label_map,
+    read_labels_told,
+    read_landmarks,
+    read_mesh,
+    read_path_points,
+    segment_names,
+    write_landmarks,
+    write_volume,
+)
+from femoreg_torch.volume.bones import nearest_label
+from femoreg_torch.volume.dicom import is_dicom
+
+NEEDED = ("ct", "labels", "landmarks", "plan", "images")
+_COPIED = (".nii", ".nii.gz", ".nrrd", ".mha")  # volumes of one file, which are taken as they are
+_DEVICE_HU = 5000.0  # of the paper's device
+
+
+@dataclass(frozen=True)
+class NewCase:
+    """What a case is made of; what is None or empty was not given. See the command's help."""
+
+    ct: Path | None = None
+    series: str | None = None
+    labels: Path | None = None
+    bones: str | None = None
+    landmarks: Path | None = None
+    plan: Path | None = None
+    side: Side | None = None
+    device: Path | None = None
+    device_points: Path | None = None
+    material: str | None = None
+    hu: float | None = None
+    guide: str | None = None
+    before_entry_mm: float = 0.0
+    turned_deg: float = 0.0
+    in_front_mm: float = 0.0
+    device_transform: Path | None = None
+    images: tuple[Path, ...] = ()
+    device_images: tuple[Path, ...] = ()
+    carm: str | None = None
+    intensity: Intensity = "raw"
+
+
+def make_case(out: Path, given: NewCase) -> list[str]:
+    """Make the case folder `out`, which must not be there yet, and return what was assumed or done, in words.
+
+    Raises `InputError` that lists everything that is missing or wrong; then nothing is written.
+    """
+    out = Path(out)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is there already. Choose a new name for the case.")
+    _check_given(given)
+    notes: list[str] = []
+    with new_folder(out) as folder:
+        content = _content(folder, given, notes)
+        text = yaml.safe_dump(plain(content), sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+        write_text(folder / "case.yaml", text)
+        checked = check_case(folder, find_start=False)
+        if checked.problems:
+            told = [problem.replace(str(folder), str(out)) for problem in checked.problems]
+            raise InputError(_together(f"{out}: not written", told))
+        notes += checked.warnings
+    return notes
+
+
+def _check_given(given: NewCase) -> None:
+    """Raises `InputError` for all flags that are missing, and files that are not there, at once."""
+    told = [f"--{name} is missing" for name in NEEDED if not getattr(given, name)]
+    paths = {name: getattr(given, name) for name in ("ct", "labels", "landmarks", "plan", "device", "device_points")}
+    for name, path in {**paths, "device_transform": given.device_transform}.items():
+        if path is not None and not Path(path).exists():
+            told.append(f"--{name.replace('_', '-')}: there is no {path}")
+    for flag, images in (("images", given.images), ("device-images", given.device_images)):
+        told += [f"--{flag}: there is no {path}" for path in images if not path.exists()]
+    if given.device is not None and given.device_points is None:
+        told.append("--device-points is missing: the device's tip and base")
+    if given.device is None and (given.device_images or given.device_points):
+        told.append("--device is missing, the model that --device-images or --device-points are of")
+    if given.material is not None and given.hu is not None:
+        told.append("--material and --hu are both given: keep one")
+    if given.guide is not None and given.device_transform is not None:
+        told.append("--guide and --device-transform are both given: keep one")
+    if told:
+        raise InputError(_together("new-case", told))
+
+
+def _together(what: str, told: list[str]) -> str:
+    if len(told) == 1:
+        return f"{what}: {told[0]}"
+    return f"{what}, {len(told)} problems: " + " ".join(f"({n}) {one}" for n, one in enumerate(told, 1))
+
+
+def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
+    """What `case.yaml` is to hold; the files it names are copied into `folder`."""
+    assert given.ct is not None  # seen by `_check_given`, as the others
+    assert given.labels is not None
+    assert given.landmarks is not None
+    assert given.plan is not None
+    ct, told = read_ct_told(given.ct, given.series)
+    notes += told
+    landmarks = read_landmarks(given.landmarks)
+    entry_point, target = read_path_points(given.plan)
+    bones = _bones(given)
+    labels_name, labels = _labels(folder, given.labels, ct, bones, notes)
+    side = given.side or _side(labels, ct, bones, landmarks, entry_point, notes)
+    if femoral_head(side) not in landmarks:
+        raise InputError(
+            f"{given.landmarks}: {femoral_head(side)}, the head of the operated femur, is missing. Place it in 3D "
+            "Slicer, in the centre of the head."
+        )
+    write_landmarks(folder / "landmarks.json", landmarks)
+    content: dict[str, Any] = {
+        "version": VERSIONS[-1],
+        "template": TEMPLATE,
+        "side": side,
+        "ct": {"image": _ct(folder, given.ct, ct), "labels": labels_name, "bones": _told_bones(bones)},
+        "landmarks": "landmarks.json",
+        "plan": {"entry_point": entry_point, "target": "FH" if target is None else target},
+    }
+    if target is None:
+        notes.append("the path's target is the femoral head, as the plan has no other")
+    if given.device is not None:
+        content[DEVICE] = _device(folder, given, notes)
+    images, device_images = _files(given.images), _files(given.device_images)
+    content["carm"] = _carm(folder, given, images[0], notes)
+    content["views"] = _views(folder, images, device_images, given.intensity, notes)
+    return content
+
+
+def _ct(folder: Path, path: Path, ct: Volume) -> str:
+    if path.is_file() and path.name.lower().endswith(_COPIED):
+        return _copied(path, folder, "ct")
+    write_volume(folder / "ct.nii.gz", ct)
+    return "ct.nii.gz"
+
+
+def _copied(path: Path, folder: Path, stem: str) -> str:
+    """Copy a file under a name that says what it is, and return that name."""
+    suffix = next((s for s in (".seg.nrrd", ".nii.gz") if path.name.lower().endswith(s)), path.suffix.lower())
+    name = stem + (suffix or ".dcm")
+    shutil.copyfile(path, folder / name)
+    return name
+
+
+def _bones(given: NewCase) -> LabelTable:
+    """Which ids of the label map are which bones."""
+    assert given.labels is not None
+    if given.bones is not None:
+        return label_table(given.bones)
+    if has_names(given.labels):
+        names = segment_names(given.labels)
+        table: LabelTable = {}
+        for text, ids in names.items():
+            if bone := bone_of_name(HIP, text):
+                table[bone] = (*table.get(bone, ()), *ids)
+        if not table:
+            raise InputError(
+                f"{given.labels}: none of its parts is named after a bone; there are: {', '.join(names)[:200]}. Name "
+                f"them {', '.join(HIP.bone_names)}."
+            )
+        return table
+    there = [n for n in torch.unique(read_label_map(given.labels).data).tolist() if n]
+    fitting = fitting_tables(there)
+    hint = f"all ids of {' and of '.join(fitting)} are there" if fitting else "no shipped table fits its ids"
+    raise InputError(
+        f"--bones: is missing, and {given.labels.name} does not name its bones. Say which table its ids are of: "
+        f"{', '.join(label_table_names())}, or a YAML file ({hint})."
+    )
+
+
+def _told_bones(bones: LabelTable) -> str | dict[str, list[int]]:
+    for name in label_table_names():
+        if label_table(name) == bones:
+            return name
+    return {bone: list(ids) for bone, ids in bones.items()}
+
+
+def _labels(folder: Path, path: Path, ct: Volume, bones: LabelTable, notes: list[str]) -> tuple[str, Volume]:
+    """The name of the label map in `folder`, and the map on the grid of the CT."""
+    ids = {n for of_bone in bones.values() for n in of_bone}
+    labels, told = read_labels_told(path, ct, ids)
+    if path.is_file() and path.name.lower().endswith(_COPIED):
+        return _copied(path, folder, "labels"), labels  # what was done is done again, and told, whenever it is read
+    notes += told
+    write_volume(folder / "labels.nii.gz", labels)
+    return "labels.nii.gz", labels
+
+
+def _side(
+    labels: Volume, ct: Volume, bones: LabelTable, landmarks: dict[str, Tensor], entry_point: Tensor, notes: list[str]
+) -> Side:
+    """The side whose femur the entry point lies on. Raises `InputError` if it lies on none."""
+    found = bone_labels(labels, ct, bones, HIP, landmarks)
+    sides = {found.ids[operated_femur(side)]: side for side in ("left", "right") if operated_femur(side) in found.ids}
+    label = nearest_label(found.labels, list(sides), entry_point) if sides else None
+    if label is None:
+        where = ", ".join(f"{v:.1f}" for v in entry_point.tolist())
+        raise InputError(
+            f"--side: is missing, and the entry point ({where}) mm LPS lies on no femur of the label map. Give the "
+            "side, and check the plan's coordinate system (RAS or LPS)."
+        )
+    notes.append(f"the operated side is the {sides[label]} one, as the entry point lies on its femur")
+    return cast(Side, sides[label])
+
+
+def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
+    assert given.device is not None
+    assert given.device_points is not None
+    if is_in_ras(given.device):
+        raise InputError(
+            f"{given.device}: says that it is in RAS, so points and transforms of 3D Slicer do not fit its values. "
+            "Export it from 3D Slicer anew, with the coordinate system LPS."
+        )
+    points = read_landmarks(given.device_points, DEVICE_POINTS)
+    if missing := [name for name in ("tip", "base") if name not in points]:
+        raise InputError(f"{given.device_points}: lacks {' and '.join(missing)}. Name the points so in 3D Slicer.")
+    if "center" not in points:
+        points["center"] = torch.tensor(read_mesh(given.device).bounds.mean(0), dtype=torch.float64)
+        notes.append("errors of the device are told at the middle of its box, as no point `center` is given")
+    content: dict[str, Any] = {"model": _copied(given.device, folder, DEVICE)}
+    if given.material is not None:
+        content["material"] = given.material
+    else:
+        content["hu"] = _DEVICE_HU if given.hu is None else given.hu
+        if given.hu is None:
+            notes.append(f"the device is drawn with {_DEVICE_HU:g} HU, as neither --material nor --hu is given")
+    content["points"] = points
+    if given.device_transform is not None:
+        return content | {f"{FEMUR}_from_{DEVICE}": read_itk_transform(given.device_transform)}
+    place = NominalPlace(given.guide or ALONG_PATH, given.before_entry_mm, given.turned_deg, given.in_front_mm)
+    if given.guide is None:
+        notes.append(f"the device starts {ALONG_PATH}, its tip {given.before_entry_mm:g} mm before the entry point")
+    return content | {"start": vars(place)}
+
+
+def _files(paths: tuple[Path, ...]) -> list[Path]:
+    """The files themselves, and all files of folders, by name."""
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            found += sorted(entry for entry in path.rglob("*") if entry.is_file() and not entry.name.startswith("."))
+        else:
+            found.append(path)
+    if paths and not found:
+        raise InputError(f"{paths[0]}: a folder without files. Name images, or a folder of images.")
+    return found
+
+
+def _views(
+    folder: Path, images: list[Path], device_images: list[Path], intensity: Intensity, notes: list[str]
+) -> list[dict[str, Any]]:
+    if device_images and len(device_images) != len(images):
+        raise InputError(
+            f"--device-images: {len(device_images)} files, but there are {len(images)} images without the device. Give "
+            "one of each for every C-arm pose, in the same order."
+        )
+    views: list[dict[str, Any]] = []
+    for number, path in enumerate(images, 1):
+        view: dict[str, Any] = {"anatomy": _copied(path, folder, f"view{number}")}
+        if device_images:
+            view[DEVICE] = _copied(device_images[number - 1], folder, f"view{number}_device")
+        views.append(view | {"intensity": intensity})
+    beside = [f", with the device {_short(path)}" for path in device_images] or [""] * len(images)
+    notes += [f"view {n} is {_short(path)}{more}" for n, (path, more) in enumerate(zip(images, beside, strict=True), 1)]
+    return views
+
+
+def _short(path: Path) -> str:
+    """The file with its folder, as images of several folders often bear the same names."""
+    return str(Path(path.resolve().parent.name) / path.name)
+
+
+def _carm(folder: Path, given: NewCase, image: Path, notes: list[str]) -> str | dict[str, Any]:
+    """The preset's name, the copied YAML file's, or what the tags of a DICOM image say."""
+    if given.carm is not None:
+        if given.carm.endswith((".yaml", ".yml")):
+            if not Path(given.carm).is_file():
+                raise InputError(f"--carm: there is no file {given.carm}.")
+            return _copied(Path(given.carm), folder, "carm")
+        return given.carm
+    if not is_dicom(image):
+        raise InputError(f"--carm: is missing, and {image.name} is no DICOM file whose tags could say it.")
+    import pydicom
+
+    header = pydicom.dcmread(image, stop_before_pixels=True, force=True)
+    tags = ("DistanceSourceToDetector", "ImagerPixelSpacing", "Rows", "Columns")
+    if missing := [tag for tag in tags if header.get(tag) in (None, "")]:
+        raise InputError(
+            f"--carm: is missing, and {image.name} has no {' and no '.join(missing)}. Give a C-arm's YAML file: "
+            "{sdd_mm, pixel_mm: [row, column], shape: [rows, columns]}."
+        )
+    carm = {
+        "sdd_mm": float(header.DistanceSourceToDetector),
+        "pixel_mm": [float(v) for v in header.ImagerPixelSpacing],
+        "shape": [int(header.Rows), int(header.Columns)],
+    }
+    told = f"source to detector {carm['sdd_mm']:g} mm, pixels of {carm['pixel_mm'][0]:g} mm"  # type: ignore[index]
+    notes.append(f"the C-arm is that of the tags of {image.name}: {told}")
+    return carm

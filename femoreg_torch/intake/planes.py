@@ -1,0 +1,105 @@
+"""Three planes of a CT or a label map as one picture, as radiologists look at them: the patient's left on the right."""
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from femoreg_torch.geometry import transform_points
+from femoreg_torch.volume import Volume, resample_isotropic
+
+Picture = NDArray[np.uint8]  # (H, W, 3), blue, green, red
+_WINDOW_HU = (-250.0, 1000.0)
+_HEIGHT_PX = 420
+_TINT = 0.35
+_WHITE, _YELLOW = (255, 255, 255), (60, 230, 255)
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def three_planes(
+    grey: Volume | None,
+    labels: Volume | None,
+    colours: Mapping[int, tuple[int, int, int]],
+    marks: Mapping[str, Tensor],
+    centre: Tensor | None = None,
+) -> Picture:
+    """Axial, coronal and sagittal plane through `centre` (3,), LPS mm (by default the middle of what is labelled).
+
+    `grey` is a CT in HU (anything else is shown from its least to its greatest value), `labels` a map on the same grid
+    with RGB `colours` of its ids, `marks` points (3,) by name, LPS mm, drawn where they lie before or behind the plane.
+    One of `grey` and `labels` must be there.
+    """
+    volume = grey if grey is not None else labels
+    assert volume is not None
+    spacing = max(float(n * s) for n, s in zip(volume.data.shape[::-1], volume.spacing_mm, strict=True)) / _HEIGHT_PX
+    index_from_lps = torch.linalg.inv(volume.lps_from_index)
+    point = _middle(labels, volume) if centre is None else centre
+    index = transform_points(index_from_lps, point[None])[0]
+    at = [int(min(max(float(v), 0), n - 1)) for v, n in zip(index.round(), volume.data.shape[::-1], strict=True)]
+    panels = []
+    for axis, name in ((2, "axial"), (1, "coronal"), (0, "sagittal")):
+        across, down = ((0, 1), (0, 2), (1, 2))[2 - axis]
+        panel = _plane(grey, labels, colours, axis, at[axis])
+        size = [max(1, round(volume.data.shape[::-1][k] * volume.spacing_mm[k] / spacing)) for k in (across, down)]
+        panel = np.asarray(cv2.resize(panel, (size[0], size[1]), interpolation=cv2.INTER_NEAREST), np.uint8)
+        if down == 2:
+            panel = np.ascontiguousarray(panel[::-1])  # the head is up
+        for mark, place in marks.items():
+            where = transform_points(index_from_lps, place[None])[0].tolist()
+            column = (where[across] + 0.5) * volume.spacing_mm[across] / spacing
+            row = (where[down] + 0.5) * volume.spacing_mm[down] / spacing
+            row = size[1] - row if down == 2 else row
+            cv2.drawMarker(panel, (round(column), round(row)), _YELLOW, cv2.MARKER_CROSS, 8, 1, cv2.LINE_AA)
+            cv2.putText(panel, mark, (round(column) + 5, round(row) - 4), _FONT, 0.35, _YELLOW, 1, cv2.LINE_AA)
+        left, right = ("front", "back") if axis == 0 else ("R", "L")
+        panels.append(_captioned(panel, name, left, right))
+    height = max(panel.shape[0] for panel in panels)
+    return np.hstack([cv2.copyMakeBorder(p, 0, height - p.shape[0], 0, 6, cv2.BORDER_CONSTANT) for p in panels])
+
+
+def _middle(labels: Volume | None, volume: Volume) -> Tensor:
+    """Centre of mass of what is labelled, or the middle of the grid."""
+    if labels is None:
+        return volume.centre()
+    coarse = resample_isotropic(labels, max(*labels.spacing_mm, 4.0), nearest=True)
+    where = coarse.data.nonzero().double()
+    if len(where) == 0:
+        return volume.centre()
+    return transform_points(coarse.lps_from_index, where.mean(0).flip(0)[None])[0]
+
+
+def _plane(
+    grey: Volume | None, labels: Volume | None, colours: Mapping[int, tuple[int, int, int]], axis: int, at: int
+) -> Picture:
+    """One plane of voxels across an index axis (0: x), tinted by its labels."""
+    shape = (grey or labels).data.select(2 - axis, at).shape  # type: ignore[union-attr]  # one of the two is there
+    picture = np.zeros((*shape, 3), np.float32)
+    if grey is not None:
+        values = grey.data.select(2 - axis, at).float()
+        low, high = _window(grey)
+        picture += (((values - low) / (high - low)).clamp(0, 1) * 255).numpy()[..., None]
+    if labels is not None:
+        ids = labels.data.select(2 - axis, at).numpy()
+        for number, (red, green, blue) in colours.items():
+            inside = ids == number
+            share = 1.0 if grey is None else _TINT
+            picture[inside] = (1 - share) * picture[inside] + share * np.array([blue, green, red], np.float32)
+    return picture.astype(np.uint8)
+
+
+def _window(grey: Volume) -> tuple[float, float]:
+    low, high = (float(v) for v in grey.data.aminmax())
+    if low < _WINDOW_HU[0] and high > _WINDOW_HU[1] / 4:
+        return _WINDOW_HU
+    return low, max(high, low + 1e-6)
+
+
+def _captioned(panel: Picture, name: str, left: str, right: str) -> Picture:
+    width = panel.shape[1]
+    cv2.putText(panel, left, (6, 18), _FONT, 0.5, _WHITE, 1, cv2.LINE_AA)
+    cv2.putText(panel, right, (width - 10 * len(right) - 8, 18), _FONT, 0.5, _WHITE, 1, cv2.LINE_AA)
+    cv2.putText(panel, name, (6, panel.shape[0] - 8), _FONT, 0.45, _WHITE, 1, cv2.LINE_AA)
+    return panel

@@ -1,0 +1,97 @@
+"""The bones at the start pose over the first view, sides named, and the device where it is meant to stand."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from femoreg_torch.case import Case, StartRecord
+from femoreg_torch.evaluation.overlay import GREEN, draw_edges, monitor_picture, small_field
+from femoreg_torch.fluoro import downsample
+from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
+from femoreg_torch.intake.planes import Picture
+from femoreg_torch.registration import Scene, prepare_scene
+from femoreg_torch.registration.run import network_detector
+from femoreg_torch.registration.start import look_at, start_by_detection, start_by_landmarks
+
+_WIDTH_PX = 560
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_YELLOW, _MAGENTA, _WHITE = (60, 230, 255), (255, 60, 255), (255, 255, 255)
+
+
+@dataclass(frozen=True, eq=False)
+class StartPicture:
+    """The first view with what starts in it, and how the start was found."""
+
+    picture: Picture
+    facts: tuple[str, ...]
+
+    def below(self, above: Picture) -> Picture:
+        """Both pictures, one below the other."""
+        width = max(above.shape[1], self.picture.shape[1])
+        wide = [cv2.copyMakeBorder(p, 0, 6, 0, width - p.shape[1], cv2.BORDER_CONSTANT) for p in (above, self.picture)]
+        return np.vstack(wide)
+
+
+def picture_of_start(case: Case, landmarks: Mapping[str, Tensor] | None = None) -> StartPicture:
+    """The start poses of a case, drawn. Raises `InputError` if there is no start, as the registration would."""
+    scene = prepare_scene(case)
+    record: StartRecord | None = None
+    facts = [*scene.missing]
+    if scene.needs_landmarks:
+        if landmarks is not None:
+            record = start_by_landmarks(case, scene.anchor, landmarks)
+        else:
+            record = start_by_detection(case, scene, look_at(scene, 0, network_detector(case)))
+        used = sum(mark.used for mark in record.landmarks.values())
+        facts.append(f"start: {record.source}, {used} landmarks within {record.reprojection_rms_px:.1f} pixels")
+    poses = scene.start(None if record is None else record.camera1_from_object)
+    panels = [_panel(case, scene, poses, kind) for kind in scene.images if scene.images[kind][0] is not None]
+    return StartPicture(np.hstack(panels), tuple(facts))
+
+
+def _panel(case: Case, scene: Scene, poses: Poses, kind: str) -> Picture:
+    """The image of a kind in the first view, with the objects that it shows."""
+    factor = max(1, scene.carm.camera.shape[1] // _WIDTH_PX)
+    camera = scene.carm.camera.downsampled(factor)
+    panel = monitor_picture(downsample(scene.image(kind, 0), factor), small_field(scene, kind, 0, factor))
+    names = scene.shown(poses.camera1_from, kind)
+    draw_edges(panel, [(scene.objects[name].volume, poses.camera_from(name)[0]) for name in names], camera)
+    for name in names:
+        _write(panel, camera, poses.camera_from(name)[0], scene.objects[name].reference_point, name, GREEN)
+    if scene.anchor in poses.camera1_from:
+        camera_from_ct = poses.camera_from(scene.anchor)[0]
+        for mark, point in case.landmarks.items():
+            _write(panel, camera, camera_from_ct, point, mark, _YELLOW)
+    if case.plan is not None and case.plan.object in poses.camera1_from:
+        ends = torch.stack([case.plan.entry_point, case.plan.target])
+        start, end = project_points(camera, transform_points(poses.camera_from(case.plan.object)[0], ends)).tolist()
+        corners = [(round(column), round(row)) for column, row in (start, end)]
+        cv2.line(panel, corners[0], corners[1], _MAGENTA, 1, cv2.LINE_AA)
+    cv2.putText(panel, f"view 1, {kind}", (6, panel.shape[0] - 8), _FONT, 0.45, _WHITE, 1, cv2.LINE_AA)
+    _write_sides(panel, case, scene, poses)
+    return panel
+
+
+def _write_sides(panel: Picture, case: Case, scene: Scene, poses: Poses) -> None:
+    """R and L where the patient's right and left are in this image."""
+    if scene.anchor not in poses.camera1_from or not case.landmarks:
+        return
+    to_left = float(poses.camera_from(scene.anchor)[0][0, 0])
+    names = ("L", "R") if to_left < 0 else ("R", "L")
+    for name, column in zip(names, (8, panel.shape[1] - 22), strict=True):
+        for colour, width in (((0, 0, 0), 5), (_WHITE, 2)):  # a white letter is seen on a white background, too
+            cv2.putText(panel, name, (column, 24), _FONT, 0.7, colour, width, cv2.LINE_AA)
+
+
+def _write(
+    panel: Picture, camera: Camera, camera_from_object: Tensor, point: Tensor, text: str, colour: tuple[int, int, int]
+) -> None:
+    column, row = project_points(camera, transform_points(camera_from_object, point[None]))[0].tolist()
+    if 0 <= column < camera.shape[1] and 0 <= row < camera.shape[0]:
+        place = (round(column), round(row))
+        cv2.drawMarker(panel, place, colour, cv2.MARKER_CROSS, 7, 1, cv2.LINE_AA)
+        cv2.putText(panel, text, (place[0] + 5, place[1] - 4), _FONT, 0.38, colour, 1, cv2.LINE_AA)

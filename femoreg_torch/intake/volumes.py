@@ -1,0 +1,121 @@
+"""What is worth knowing, and worth a warning, of a CT and of a label map."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+import torch
+
+from femoreg_torch.anatomy import label_table, label_table_names
+from femoreg_torch.volume import Volume
+
+_COARSE_MM, _COARSE_STEP_MM = 1.5, 3.0  # the registration takes voxels of 1 mm
+_SOFT_HU, _BONE_HU, _METAL_HU = -50.0, 300.0, 2800.0
+_LEAST_AIR = 0.005  # share of the voxels; beside every patient there is some
+_METAL_ML = 1.0
+_FACES = ("right", "left", "front", "back", "lower", "upper")  # low and high end of x, y, z
+_DISAGREE_MM = 0.5
+
+
+def described(volume: Volume) -> str:
+    """Size, spacing and orientation in one line."""
+    size = " × ".join(str(n) for n in reversed(volume.data.shape))
+    spacing = " × ".join(f"{s:.4g}" for s in volume.spacing_mm)
+    cosines = volume.lps_from_index[:3, :3] / torch.tensor(volume.spacing_mm, dtype=torch.float64)
+    turned = float(torch.rad2deg(torch.arccos(((cosines.trace() - 1) / 2).clamp(-1, 1))))
+    low = ", ".join(f"{v:.1f}" for v in volume.lps_from_index[:3, 3].tolist())
+    axes = "along the patient's axes" if turned < 0.05 else f"oblique by {turned:.1f}°"
+    return f"{size} voxels of {spacing} mm, {axes}, first voxel at ({low}) mm LPS"
+
+
+def ct_warnings(ct: Volume) -> list[str]:
+    """In words, what may spoil a registration with this CT, HU."""
+    told = []
+    x, y, z = ct.spacing_mm
+    if max(x, y) > _COARSE_MM or z > _COARSE_STEP_MM:
+        told.append(f"coarse voxels ({x:.3g} × {y:.3g} × {z:.3g} mm): outlines of bones get blurred; 1 mm is meant")
+    low, high = (float(v) for v in ct.data.aminmax())
+    if low > _SOFT_HU or high < _BONE_HU:
+        told.append(f"values from {low:g} to {high:g} are not HU of a hip: air is −1000, bone above {_BONE_HU:g}")
+        return told
+    if low == 0 or high > 60000 or float((ct.data < -3100).float().mean()) > 0:
+        told.append(f"values from {low:g} to {high:g}: is the rescale of the scanner applied?")
+    air = float((ct.data < -500).float().mean())
+    if air < _LEAST_AIR:
+        told.append("hardly any air: the CT seems to be cropped inside the patient, so soft tissue is missing")
+    metal = float((ct.data > _METAL_HU).sum()) * float(np.prod(ct.spacing_mm)) / 1000
+    if metal > _METAL_ML:
+        told.append(f"{metal:.1f} ml above {_METAL_HU:g} HU: metal, or its artefacts")
+    for face in _touched(ct.data > _BONE_HU, least_mm2=400.0, spacing=ct.spacing_mm):
+        if face in ("right", "left", "front", "back"):
+            told.append(f"bone is cut at the {face} face of the CT")
+    return told
+
+
+def cut_bones(labels: Volume, ids: Mapping[str, int], bones: Sequence[str]) -> list[str]:
+    """In words, which of these bones the border of the volume cuts where it should not.
+
+    A shaft that is cut below, and vertebrae above, are as usual.
+    """
+    told = []
+    for name in bones:
+        if name not in ids:
+            continue
+        faces = _touched(labels.data == ids[name], least_mm2=20.0, spacing=labels.spacing_mm)
+        usual = {"lower"} if name.startswith("femur") else {"upper"} if name in ("vertebrae", "sacrum") else set()
+        if cut := [face for face in faces if face not in usual]:
+            told.append(f"{name} is cut at the {' and '.join(cut)} face of the volume")
+    return told
+
+
+def _touched(inside: torch.Tensor, least_mm2: float, spacing: tuple[float, float, float]) -> list[str]:
+    """Faces of the volume where what is inside (Z, Y, X), bool, has at least that area."""
+    found = []
+    for axis in range(3):
+        area = float(np.prod([s for k, s in enumerate(spacing) if k != axis]))
+        for end in (0, -1):
+            if float(inside.select(2 - axis, end).sum()) * area >= least_mm2:
+                found.append(_FACES[2 * axis + (end != 0)])
+    return found
+
+
+def looks_like_labels(volume: Volume) -> bool:
+    """Whether the values are few whole numbers from 0 on, as those of a label map are."""
+    low, high = (float(v) for v in volume.data.aminmax())
+    if low != 0 or high == 0 or high > 65535:
+        return False
+    sample = volume.data.flatten()[:: max(1, volume.data.numel() // 2_000_000)]
+    return bool((sample == sample.round()).all()) and len(sample.unique()) <= 256
+
+
+def fitting_tables(ids: Sequence[int]) -> list[str]:
+    """Names of the shipped label tables all of whose ids a map holds."""
+    there = set(ids)
+    return [
+        name for name in label_table_names() if {n for of_bone in label_table(name).values() for n in of_bone} <= there
+    ]
+
+
+def nifti_warnings(path: Path) -> list[str]:
+    """In words, where the header of a NIfTI file leaves open where the patient's left is, or contradicts itself."""
+    if not path.name.lower().endswith((".nii", ".nii.gz")):
+        return []
+    image: Any = nibabel.load(path)  # its declared type is that of all formats
+    header = image.header
+    codes = int(header["sform_code"]), int(header["qform_code"])
+    if codes == (0, 0):
+        return [
+            "the NIfTI header has neither sform nor qform: its axes are assumed to run to the right, front and head"
+        ]
+    if min(codes) == 0:
+        return []
+    size = np.array([*header.get_data_shape()[:3], 2]) - 1
+    corners = np.array([[size[k] * (n >> k & 1) for k in range(3)] + [1] for n in range(8)])
+    apart = float(np.linalg.norm((corners @ (header.get_sform() - header.get_qform()).T), axis=1).max())
+    if apart > _DISAGREE_MM:
+        return [
+            f"sform and qform of the NIfTI header disagree by up to {apart:.1f} mm; programs differ in which they take"
+        ]
+    return []

@@ -1,0 +1,333 @@
+"""CT from DICOM: the series of a folder, and one of them as a volume with its true geometry.
+
+GDCM, in SimpleITK, decodes the pixels, compressed ones as well, and applies each slice's rescale. Where the slices lie
+is read here, from Image Position and Image Orientation (DICOM PS3.3, C.7.6.2), since ITK's reader of series passes over
+missing slices, and over the shear of a tilted gantry.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import SimpleITK as sitk
+from numpy.typing import NDArray
+
+from femoreg_torch.errors import InputError
+
+_TAGS = (
+    "SOPInstanceUID", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "ImageType", "Rows",
+    "Columns", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "NumberOfFrames", "AcquisitionNumber",
+)  # fmt: skip
+_VOLUMES = ("CT", "MR", "PT", "NM", "OT")  # modalities whose series may be volumes; others are images, reports, masks
+_AIR_HU = -1024.0  # what lies outside the slices of a tilted gantry
+_NOT_DICOM = {".gz", ".nii", ".nrrd", ".mha", ".mhd", ".json", ".txt", ".png", ".jpg", ".tif", ".tiff", ".zip", ".stl"}
+_SAME_PLACE_MM = 0.01  # slices that are closer are one
+_STEP = 0.02  # of a slice's step: what rounding of positions may make of it
+
+
+@dataclass(frozen=True)
+class Slice:
+    """What the header of one DICOM file says."""
+
+    path: Path
+    header: Any  # pydicom.Dataset with some of `_TAGS`
+
+    def numbers(self, name: str, count: int) -> NDArray[np.float64] | None:
+        """The numbers of a tag, or None where it is missing or holds something else."""
+        value = self.header.get(name)
+        try:
+            numbers = np.asarray(value, np.float64)
+        except (TypeError, ValueError):
+            return None
+        return numbers if numbers.shape == (count,) and np.isfinite(numbers).all() else None
+
+    def whole(self, name: str, otherwise: int) -> int:
+        """The whole number of a tag."""
+        try:
+            return int(self.header.get(name) or otherwise)
+        except (TypeError, ValueError):
+            return otherwise
+
+
+@dataclass(frozen=True)
+class Series:
+    """The files of one DICOM series."""
+
+    uid: str
+    slices: tuple[Slice, ...]
+    number: str = ""
+    description: str = ""
+    modality: str = ""
+
+    @property
+    def told(self) -> str:
+        """The series in a few words."""
+        named = f" “{self.description}”" if self.description else ""
+        return f"series {self.number or '?'}{named} ({self.modality or 'no modality'}, {len(self.slices)} files)"
+
+    @property
+    def may_be_volume(self) -> bool:
+        """Whether it may be a CT: several slices, or one file of several frames, and no scout."""
+        first = self.slices[0]
+        scout = "LOCALIZER" in [str(word).upper() for word in first.header.get("ImageType") or []]
+        frames = first.whole("NumberOfFrames", 1)
+        return self.modality in _VOLUMES and not scout and (len(self.slices) > 1 or frames > 1)
+
+
+def is_dicom(path: Path) -> bool:
+    """Whether a file is DICOM: by its preamble, or, without one, by a first element of the group 0002 or 0008."""
+    if not path.is_file() or path.suffix.lower() in _NOT_DICOM:
+        return False
+    with path.open("rb") as file:
+        head = file.read(132)
+    bare = len(head) == 132 and head[:2] in (b"\x02\x00", b"\x08\x00") and head[3:4] == b"\x00"
+    return head[128:] == b"DICM" or bare
+
+
+def series_in(folder: Path) -> list[Series]:
+    """All DICOM series in a folder and in the folders inside it, in order of their numbers.
+
+    A file that stands there twice, by its SOP Instance UID, counts once.
+    """
+    found: dict[str, dict[str, Slice]] = {}
+    for one in _headers(folder):
+        uid = str(one.header.get("SeriesInstanceUID") or "")
+        if uid:
+            found.setdefault(uid, {}).setdefault(str(one.header.get("SOPInstanceUID") or one.path), one)
+    series = []
+    for uid, slices in found.items():
+        first = next(iter(slices.values())).header
+        words = (str(first.get(tag) or "").strip() for tag in ("SeriesNumber", "SeriesDescription", "Modality"))
+        number, description, modality = words
+        series.append(Series(uid, tuple(slices.values()), number, description, modality))
+    return sorted(series, key=lambda one: (not one.number.isdecimal(), one.number.zfill(9), one.uid))
+
+
+def _headers(folder: Path) -> Iterator[Slice]:
+    for path in sorted(folder.rglob("*")):
+        if path.name.upper() != "DICOMDIR" and is_dicom(path):
+            yield Slice(path, _header(path))
+
+
+def _header(path: Path) -> Any:
+    """Some tags of a DICOM file, as a `pydicom.Dataset`. Raises `InputError`."""
+    import pydicom  # a fifth of a second, and most CTs are of other kinds
+    from pydicom.errors import InvalidDicomError
+
+    try:
+        return pydicom.dcmread(path, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
+    except (InvalidDicomError, OSError, ValueError, AttributeError, KeyError) as error:
+        raise InputError(
+            f"{path}: its DICOM header cannot be read ({error}). Export the series anew, or take the file away."
+        ) from error
+
+
+def choose_series(path: Path, wanted: str | None = None) -> Series:
+    """The series that `path` stands for: the one volume in a folder, or that of a file, from the folder it lies in.
+
+    `wanted` names one of several: its number, its UID, or a part of its description. Raises `InputError` that names
+    them all if that leaves none or several.
+    """
+    folder = path if path.is_dir() else path.parent
+    there = series_in(folder)
+    if not there or (path.is_file() and not _header(path).get("SeriesInstanceUID")):
+        raise InputError(f"{path}: holds no DICOM series. Give the folder of the slices, or a NIfTI, NRRD or MHA file.")
+    if path.is_file():
+        uid = str(_header(path).get("SeriesInstanceUID") or "")
+        return next(one for one in there if one.uid == uid)
+    if wanted is not None:
+        exact = [one for one in there if wanted in (one.number, one.uid)]
+        chosen = exact or [one for one in there if wanted.lower() in one.description.lower()]
+    else:
+        chosen = [one for one in there if one.may_be_volume]
+    if len(chosen) == 1:
+        return chosen[0]
+    listed = ", ".join(one.told for one in chosen or there)
+    if wanted is not None:
+        how = f"{len(chosen)} of its series are {wanted!r}" if chosen else f"none of its series is {wanted!r}"
+        raise InputError(f"{folder}: {how}; there are: {listed}. Give one's number, its UID or a part of its name.")
+    if not chosen:
+        raise InputError(f"{folder}: none of its DICOM series is a volume; there are: {listed}. Choose another folder.")
+    raise InputError(
+        f"{folder}: holds {len(chosen)} DICOM series, one was expected: {listed}. Choose one: `--series NUMBER` of "
+        "`femoreg new-case`, or in case.yaml the path of one of its files."
+    )
+
+
+def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:
+    """A series as a volume, and what was done to it in words.
+
+    Slices are sorted along their normal. Those of a tilted gantry are brought onto a rectangular grid, by linear
+    interpolation. Raises `InputError` for slices that are missing, doubled, unevenly spaced or of different kinds, and
+    for pixels that cannot be decoded.
+    """
+    where = str(series.slices[0].path.parent)
+    if len(series.slices) == 1:
+        if series.slices[0].whole("NumberOfFrames", 1) < 2:
+            raise InputError(f"{series.slices[0].path}: is a single slice. Give the folder of the whole series.")
+        return _multi_frame(series.slices[0].path), ()
+    layout = _sorted_slices(series, where)
+    image = _decoded([one.path for one in layout.slices])
+    image.SetOrigin(layout.origin.tolist())
+    spacing = (*layout.spacing.tolist(), layout.step @ layout.axes[:, 2])
+    image.SetSpacing([float(value) for value in spacing])
+    image.SetDirection(layout.axes.ravel().tolist())
+    lean = layout.step - (layout.step @ layout.axes[:, 2]) * layout.axes[:, 2]
+    if np.linalg.norm(lean) <= _STEP * np.linalg.norm(layout.step):
+        return image, ()
+    angle = np.degrees(np.arcsin(np.linalg.norm(lean) / np.linalg.norm(layout.step)))
+    note = f"the gantry was tilted by {angle:.1f}°: the slices of {where} were brought onto a rectangular grid"
+    return _straightened(image, lean), (note,)
+
+
+def _decoded(paths: Sequence[Path]) -> sitk.Image:
+    """The pixels of all slices, rescaled, as float32; by pydicom where GDCM cannot. Raises `InputError`."""
+    reader = sitk.ImageSeriesReader()
+    reader.SetFileNames([str(path) for path in paths])
+    reader.SetOutputPixelType(sitk.sitkFloat32)
+    try:
+        return reader.Execute()
+    except RuntimeError:  # some RLE, and files without a preamble
+        return sitk.GetImageFromArray(np.stack([_pixels(path) for path in paths]))
+
+
+def _pixels(path: Path) -> NDArray[np.float32]:
+    import pydicom
+    from pydicom.pixels import apply_rescale
+
+    data = pydicom.dcmread(path, force=True)
+    try:
+        return apply_rescale(data.pixel_array, data).astype(np.float32)
+    except (AttributeError, KeyError, NotImplementedError, RuntimeError, ValueError) as error:
+        raise InputError(f"{path}: the slice cannot be decoded ({error}). Export the series anew.") from error
+
+
+@dataclass(frozen=True, eq=False)
+class _Layout:
+    """Where the slices of a series lie."""
+
+    slices: tuple[Slice, ...]  # along the normal
+    axes: NDArray[np.float64]  # (3, 3), columns: along the pixels of a row, along those of a column, normal
+    spacing: NDArray[np.float64]  # (2,) along these
+    origin: NDArray[np.float64]  # (3,) centre of the first pixel of the first slice, LPS mm
+    step: NDArray[np.float64]  # (3,) from slice to slice
+
+
+def _sorted_slices(series: Series, where: str) -> _Layout:
+    first = series.slices[0]
+    geometry = {
+        name: first.numbers(name, count) for name, count in (("ImageOrientationPatient", 6), ("PixelSpacing", 2))
+    }
+    for name in ("ImageOrientationPatient", "PixelSpacing", "ImagePositionPatient"):
+        lacking = [one.path.name for one in series.slices if name not in one.header]
+        if lacking:
+            raise InputError(
+                f"{where}: {len(lacking)} slices have no {name} ({lacking[0]}, …). Export the series anew."
+            )
+    cosines, pixel = geometry["ImageOrientationPatient"], geometry["PixelSpacing"]
+    positions = [one.numbers("ImagePositionPatient", 3) for one in series.slices]
+    if cosines is None or pixel is None or any(position is None for position in positions):
+        raise InputError(f"{where}: position, orientation or pixel spacing of a slice are no numbers. Export it anew.")
+    _check_alike(series, cosines, pixel, where)
+    row, column = cosines[:3] / np.linalg.norm(cosines[:3]), cosines[3:] / np.linalg.norm(cosines[3:])
+    normal = np.cross(row, column)
+    if abs(np.linalg.norm(normal) - 1) > 1e-3:
+        raise InputError(f"{where}: the axes of the slices are not at right angles. Export the series anew.")
+    places = np.array(positions)
+    order = np.argsort(places @ normal, kind="stable")
+    slices, places = tuple(series.slices[n] for n in order), places[order]
+    _check_steps(slices, places @ normal, where)
+    step = (places[-1] - places[0]) / (len(places) - 1)
+    off = places - (places[0] + np.arange(len(places))[:, None] * step)
+    if (worst := np.linalg.norm(off, axis=1).max()) > 0.1 * np.linalg.norm(step) + 0.05:
+        raise InputError(
+            f"{where}: the slices lie up to {worst:.2g} mm beside one straight line. Export the series anew, as one "
+            "reconstruction."
+        )
+    axes = np.stack([row, column, normal / np.linalg.norm(normal)], 1)
+    return _Layout(slices, axes, pixel[::-1], places[0], step)
+
+
+def _check_alike(series: Series, cosines: NDArray[np.float64], pixel: NDArray[np.float64], where: str) -> None:
+    """Raises `InputError` if slices differ in size, spacing or orientation: a series of several reconstructions."""
+    sizes = Counter((one.whole("Rows", 0), one.whole("Columns", 0)) for one in series.slices)
+    if len(sizes) > 1:
+        listed = ", ".join(f"{count} of {rows} × {columns}" for (rows, columns), count in sizes.most_common())
+        raise InputError(f"{where}: {series.told} holds slices of several sizes ({listed}). Export one reconstruction.")
+    for one in series.slices:
+        turned, spaced = one.numbers("ImageOrientationPatient", 6), one.numbers("PixelSpacing", 2)
+        if turned is None or spaced is None or abs(turned - cosines).max() > 1e-3 or abs(spaced - pixel).max() > 1e-3:
+            raise InputError(
+                f"{where}: {one.path.name} has another orientation or pixel spacing than {series.slices[0].path.name}. "
+                "Export one reconstruction."
+            )
+
+
+def _check_steps(slices: Sequence[Slice], heights: NDArray[np.float64], where: str) -> None:
+    """Raises `InputError` for slices that are doubled, missing or unevenly spaced."""
+    steps = np.diff(heights)
+    close = steps < _SAME_PLACE_MM
+    if close.any():
+        first = int(np.flatnonzero(close)[0])
+        acquisitions = {one.header.get("AcquisitionNumber") for one in slices}
+        phases = f" from {len(acquisitions)} acquisitions" if len(acquisitions) > 1 else ""
+        raise InputError(
+            f"{where}: {int(close.sum())} slices{phases} lie where another one lies (as {slices[first].path.name} and "
+            f"{slices[first + 1].path.name}). Keep one reconstruction or phase."
+        )
+    usual = float(steps.min())
+    gaps = steps > 1.5 * usual
+    if gaps.any() and np.allclose(steps / usual, np.rint(steps / usual), atol=0.1):
+        after = ", ".join(slices[n].path.name for n in np.flatnonzero(gaps)[:3])
+        missing = int(np.rint(steps[gaps] / usual).sum() - gaps.sum())
+        raise InputError(
+            f"{where}: {missing} of {len(slices) + missing} slices are missing (after {after}), at steps of "
+            f"{usual:.4g} mm. Copy the whole series."
+        )
+    if steps.max() > 1.1 * usual:
+        raise InputError(
+            f"{where}: the slices are {steps.min():.4g} to {steps.max():.4g} mm apart. Reconstruct or export the "
+            "series with one step."
+        )
+
+
+def _straightened(image: sitk.Image, lean: NDArray[np.float64]) -> sitk.Image:
+    """A volume whose slices are shifted by `lean` (3,) mm more, one after the other, on a rectangular grid."""
+    size, spacing = np.array(image.GetSize()), np.array(image.GetSpacing())
+    axes, origin = np.reshape(image.GetDirection(), (3, 3)), np.array(image.GetOrigin())
+    shift = axes[:, :2].T @ lean / spacing[:2] * (size[2] - 1)  # of the last slice against the first, pixels
+    low, high = np.floor(np.minimum(shift, 0)), np.ceil(np.maximum(shift, 0))
+    grid = [int(n) for n in (*(size[:2] + high - low).astype(int), size[2])]
+    start = origin + axes[:, :2] @ (low * spacing[:2])
+    # where a point of the patient lies in the stored volume, whose slices all stand upright there
+    sheared = np.eye(3) - np.outer(lean, axes[:, 2]) / spacing[2]
+    upright = sitk.AffineTransform(sheared.ravel().tolist(), [0.0, 0.0, 0.0], origin.tolist())
+    return sitk.Resample(
+        image, grid, upright, sitk.sitkLinear, start.tolist(), spacing.tolist(), axes.ravel().tolist(), _AIR_HU
+    )
+
+
+def _multi_frame(path: Path) -> sitk.Image:
+    """An enhanced CT: all slices as frames of one file. Raises `InputError`."""
+    import highdicom  # half a second, and few CTs are of this kind
+
+    try:
+        volume = highdicom.imread(path).get_volume(dtype=np.float32)
+    except (AttributeError, KeyError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: its frames cannot be read as one volume ({error}). Export the series with a file for each slice."
+        ) from error
+    return image_of(volume.array, volume.affine)
+
+
+def image_of(array: NDArray[Any], lps_from_index: NDArray[np.float64]) -> sitk.Image:
+    """A volume of highdicom, whose `array` is indexed as the columns of its affine are, as an image of SimpleITK."""
+    image = sitk.GetImageFromArray(np.ascontiguousarray(array.transpose(2, 1, 0)))
+    spacing = np.linalg.norm(lps_from_index[:3, :3], axis=0)
+    image.SetSpacing(spacing.tolist())
+    image.SetDirection((lps_from_index[:3, :3] / spacing).ravel().tolist())
+    image.SetOrigin(lps_from_index[:3, 3].tolist())
+    return image

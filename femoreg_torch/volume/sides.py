@@ -1,0 +1,96 @@
+"""Do label map and landmarks tell left from right, and do they lie on one another? Patient space says what left is."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.anatomy import Anatomy
+from femoreg_torch.volume.bones import BoneLabels, nearest_label, nearest_voxel
+from femoreg_torch.volume.labels import label_box_centre
+
+_CLOSER_MM, _FAR_MM = 2.0, 30.0
+_RAS = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
+
+
+def swapped_sides(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy | None) -> list[str]:
+    """In words, where the names of sides contradict patient space, or landmarks (3,), LPS mm, the label map.
+
+    Empty if nothing does. A bone `…_left` must lie to the left (+x) of its mirror, and most landmarks on bones of their
+    own side.
+    """
+    if anatomy is None:
+        return []
+    told = []
+    for bone in anatomy.bones:
+        if not bone.name.endswith("_left") or not {bone.name, bone.mirror} <= set(bones.ids):
+            continue
+        left, right = (label_box_centre(bones.labels, [bones.ids[name]])[0] for name in (bone.name, bone.mirror))
+        if left < right:
+            told.append(
+                f"label map: {bone.name} lies to the right of {bone.mirror}: left and right are swapped in `ct.bones`, "
+                "or the label map is mirrored. Exchange the two ids, or export it anew"
+            )
+    own, other = _votes(bones, landmarks, anatomy)
+    if len(other) > len(own) and _mixed_up(bones, landmarks, anatomy):
+        told.append(
+            f"landmarks: {', '.join(other)} lie on the other side, and fit the bones better with x and y negated: the "
+            "file holds RAS and says LPS, or the other way round. Correct its coordinate system"
+        )
+    elif len(other) > len(own):
+        told.append(
+            f"landmarks: left and right are swapped: {', '.join(other)} lie on bones of the other side. Exchange the "
+            "endings -l and -r"
+        )
+    return told
+
+
+def stray_landmarks(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy | None) -> list[str]:
+    """In words, which landmarks (3,), LPS mm, lie near no voxel of their bone; empty if none does."""
+    if anatomy is None:
+        return []
+    asked = [mark for mark in anatomy.landmarks if mark.name in landmarks and mark.bone in bones.ids]
+    own, other = _votes(bones, landmarks, anatomy)
+    stray = [mark.name for mark in asked if mark.name not in (*own, *other)]
+    if not stray:
+        return []
+    flipped, _ = _votes(bones, {name: landmarks[name] * _RAS for name in stray}, anatomy)
+    if 2 * len(flipped) > len(stray):
+        return [
+            f"landmarks: {', '.join(stray)} lie on no bone, but would with x and y negated: the file holds RAS and "
+            "says LPS, or the other way round. Correct its coordinate system"
+        ]
+    return [f"landmarks: {', '.join(stray)} lie far from the bones that they are named after. Place them anew"]
+
+
+def _mixed_up(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy) -> bool:
+    """Whether landmarks lie much closer to the bones, of either side, with x and y negated."""
+    told = _misfit_mm(bones, landmarks, anatomy)
+    negated = _misfit_mm(bones, {name: point * _RAS for name, point in landmarks.items()}, anatomy)
+    return negated < told / 2 and told - negated > _CLOSER_MM
+
+
+def _misfit_mm(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy) -> float:
+    """Mean distance of landmarks from their bones or the mirrors of these; where none is near, that counts as far."""
+    distances = []
+    for mark in anatomy.landmarks:
+        sides = [name for name in (mark.bone, anatomy.bone(mark.bone).mirror) if name in bones.ids]
+        if mark.name in landmarks and sides:
+            found = nearest_voxel(bones.labels, [bones.ids[name] for name in sides], landmarks[mark.name])
+            distances.append(_FAR_MM if found is None else found[1])
+    return sum(distances) / max(len(distances), 1)
+
+
+def _votes(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy) -> tuple[list[str], list[str]]:
+    """Names of the landmarks that lie nearest to their own bone, and to its mirror, as far as any is near."""
+    own, other = [], []
+    for mark in anatomy.landmarks:
+        if mark.name not in landmarks or mark.bone not in bones.ids:
+            continue
+        sides = [name for name in (mark.bone, anatomy.bone(mark.bone).mirror) if name in bones.ids]
+        near = nearest_label(bones.labels, [bones.ids[name] for name in sides], landmarks[mark.name])
+        if near == bones.ids[mark.bone]:
+            own.append(mark.name)
+        elif near is not None:
+            other.append(mark.name)
+    return own, other

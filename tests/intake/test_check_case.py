@@ -1,0 +1,247 @@
+"""Twenty broken cases with two to five faults each: every fault is told, each once, and nothing else."""
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import nibabel
+import numpy as np
+import pytest
+from intake_files import HEAD, case_content, landmarks, markups, ras_affine, write_content, write_files
+
+from femoreg_torch.case import read_case
+from femoreg_torch.commands.main import main
+from femoreg_torch.errors import InputError
+from femoreg_torch.intake import check_case
+from femoreg_torch.intake.volumes import ct_warnings
+from femoreg_torch.registration import prepare_scene
+from femoreg_torch.volume import read_ct, read_label_map
+
+Content = dict[str, Any]
+Fault = tuple[Callable[[Content, Path], object], str]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_files(tmp_path_factory.mktemp("files") / "case")
+
+
+def renamed(c: Content, folder: Path, **names: str) -> None:
+    (folder / "landmarks.mrk.json").write_text(markups({names.get(k, k): v for k, v in landmarks().items()}))
+
+
+def swapped(c: Content, folder: Path) -> None:
+    other = {"l": "r", "r": "l"}
+    (folder / "landmarks.mrk.json").write_text(markups({k[:-1] + other[k[-1]]: v for k, v in landmarks().items()}))
+
+
+def moved(c: Content, folder: Path, name: str, to: tuple[float, ...]) -> None:
+    (folder / "landmarks.mrk.json").write_text(markups(landmarks() | {name: to}))
+
+
+def few(c: Content, folder: Path) -> None:
+    (folder / "landmarks.mrk.json").write_text(markups({k: landmarks()[k] for k in ("FH-l", "ASIS-l", "FH-r")}))
+
+
+def flipped(c: Content, folder: Path) -> None:
+    """Points of RAS in a file that says LPS."""
+    (folder / "landmarks.mrk.json").write_text(markups({k: (-x, -y, z) for k, (x, y, z) in landmarks().items()}))
+
+
+def relabelled(c: Content, folder: Path, old: int, new: int) -> None:
+    image = nibabel.load(folder / "labels.nii.gz")
+    values = np.asarray(image.dataobj).copy()
+    values[values == old] = new
+    nibabel.save(nibabel.Nifti1Image(values, ras_affine()), folder / "labels.nii.gz")
+
+
+def attenuation(c: Content, folder: Path) -> None:
+    values = np.asarray(nibabel.load(folder / "ct.nii.gz").dataobj)
+    nibabel.save(nibabel.Nifti1Image((values + 1000) * np.float32(2e-5), ras_affine()), folder / "ct.nii.gz")
+
+
+def open_mesh(c: Content, folder: Path) -> None:
+    import trimesh
+
+    mesh = trimesh.load(folder / "device.stl")
+    trimesh.Trimesh(mesh.vertices, mesh.faces[3:]).export(folder / "device.stl")
+
+
+FAULTS: dict[str, Fault] = {
+    "side": (lambda c, f: c.update(side="links"), r"case\.yaml, side: left or right was expected, found 'links'"),
+    "extra key": (lambda c, f: c.update(sides="left"), r"case\.yaml, sides: unknown key"),
+    "extra ct key": (lambda c, f: c["ct"].update(lables="x"), r"ct\.lables: unknown key"),
+    "no ct": (lambda c, f: c["ct"].update(image="none.nii.gz"), r"ct\.image: there is no file .*none\.nii\.gz"),
+    "no labels": (lambda c, f: c["ct"].pop("labels"), r"ct\.labels: is missing, a label map"),
+    "table": (lambda c, f: c["ct"].update(bones="totalseg"), r"ct\.bones: .*totalseg"),
+    "no femur": (lambda c, f: relabelled(c, f, 5, 0), r"label map: no voxel carries the label 5, the femur_left"),
+    "attenuation": (attenuation, r"ct\.nii\.gz: values run from 0 to .* Hounsfield"),
+    "bad name": (lambda c, f: renamed(c, f, **{"GSN-l": "notch"}), r"landmarks\.mrk\.json: unknown landmark 'notch'"),
+    "swapped": (swapped, r"landmarks: left and right are swapped: .*Exchange the endings"),
+    "outside": (lambda c, f: moved(c, f, "GSN-r", (-60, 380, 10)), r"landmark GSN-r at .* lies outside the CT"),
+    "stray": (lambda c, f: moved(c, f, "ASIS-l", (10, -90, -110)), r"landmarks: ASIS-l lie far from the bones"),
+    "flipped": (flipped, r"landmarks: FH-l, .* fit the bones better with x and y negated: the file holds RAS"),
+    "few": (few, r"landmarks: 3 of them, but the start pose takes at least 4"),
+    "plan number": (lambda c, f: c["plan"].update(entry_point=[1, 2]), r"plan\.entry_point: a point \[x, y, z\]"),
+    "plan far": (
+        lambda c, f: c["plan"].update(entry_point=[20, -80, 90]),
+        r"plan: the entry point \(20\.0, -80\.0, 90\.0\)",
+    ),
+    "plan side": (
+        lambda c, f: c["plan"].update(entry_point=[-148, 0, -70]),
+        r"entry point lies on the femur_right, but",
+    ),
+    "plan turned": (
+        lambda c, f: c["plan"].update(entry_point=list(HEAD), target=[148, 0, -70]),
+        r"plan: the entry point lies nearer to the femoral head than the target",
+    ),
+    "no model": (
+        lambda c, f: c["device"].update(model="device.step"),
+        r"device\.model: there is no file .*device\.step",
+    ),
+    "open mesh": (open_mesh, r"device\.stl: .*not closed|device\.stl: .*hole|device\.stl: .*closed"),
+    "two materials": (lambda c, f: c["device"].update(material="steel"), r"device\.material: `hu` is given too"),
+    "no base": (lambda c, f: c["device"]["points"].pop("base"), r"device\.points\.base: is missing"),
+    "tip word": (lambda c, f: c["device"]["points"].update(tip="x"), r"device\.points\.tip: a point"),
+    "guide": (lambda c, f: c["device"].update(start={"guide": "upwards"}), r"device\.start: guide: one of along"),
+    "no start": (lambda c, f: c["device"].pop("start"), r"device\.camera1_from_device: is missing, the nominal"),
+    "carm": (lambda c, f: c.update(carm="siemens"), r"case\.yaml, carm: .*siemens"),
+    "view missing": (lambda c, f: (f / "view2.png").unlink(), r"views\[1\]\.anatomy: there is no file"),
+    "view shape": (
+        lambda c, f: cv2.imwrite(str(f / "view3.png"), np.arange(400, dtype=np.uint16).reshape(20, 20) * 9),
+        r"views\[2\]\.anatomy: it is 20 × 20 pixels, but the C-arm has 48 × 40",
+    ),
+    "view twice": (
+        lambda c, f: shutil.copy(f / "view1_device.png", f / "view3_device.png"),
+        r"views\[2\]\.device: the same image as views\[0\]\.device",
+    ),
+    "view text": (lambda c, f: (f / "view1.png").write_text("text"), r"view1\.png: cannot be read as a PNG"),
+    "intensity": (lambda c, f: c["views"][1].update(intensity="dark"), r"views\[1\]\.intensity: raw or log"),
+    "field": (
+        lambda c, f: c["views"][0].update(field={"circle": {"centre": [1, 2], "radius": -3}}),
+        r"radius: a positive",
+    ),
+    "no views": (lambda c, f: c.update(views=[]), r"views: empty"),
+}
+
+BROKEN = [
+    ("side", "no ct", "view missing"),
+    ("extra key", "extra ct key", "table", "carm"),
+    ("no labels", "bad name", "tip word", "no start"),
+    ("attenuation", "view shape", "two materials"),
+    ("swapped", "plan far", "intensity"),
+    ("outside", "no model", "view twice"),
+    ("stray", "view text", "guide"),
+    ("few", "open mesh", "field"),
+    ("plan number", "no base", "view missing", "view shape"),
+    ("plan side", "view twice", "extra key"),
+    ("plan turned", "no start", "carm"),
+    ("no femur", "view text", "intensity", "field"),
+    ("no ct", "bad name", "guide"),
+    ("side", "flipped", "open mesh"),
+    ("table", "outside", "plan turned", "no base"),
+    ("no views", "two materials", "stray"),
+    ("attenuation", "few", "tip word", "extra key", "field"),
+    ("no labels", "no model", "intensity", "view twice"),
+    ("extra ct key", "plan side", "view shape", "guide"),
+    ("no femur", "swapped", "carm", "view text"),
+]
+
+
+@pytest.mark.parametrize("names", BROKEN, ids=[" + ".join(names) for names in BROKEN])
+def test_every_fault_of_a_broken_case_is_told_at_once(files: Path, tmp_path: Path, names: tuple[str, ...]) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    content = case_content()
+    for name in names:
+        FAULTS[name][0](content, folder)
+    write_content(folder, content)
+    found = check_case(folder, find_start=False)
+    for name in names:
+        told = [problem for problem in found.problems if re.search(FAULTS[name][1], problem)]
+        assert len(told) == 1, f"{name}: {found.problems}"
+    assert len(found.problems) == len(names), found.problems
+    assert all("\n" not in problem for problem in found.problems)
+    no_ct = {"no ct", "attenuation"} & set(names)
+    assert (found.picture is None) == bool(no_ct)
+
+
+def test_there_are_twenty_with_several_faults_each_and_all_faults_occur() -> None:
+    assert len(BROKEN) == 20
+    assert min(map(len, BROKEN)) >= 2
+    assert {name for names in BROKEN for name in names} == set(FAULTS)
+
+
+def test_a_right_case_has_no_problem_and_is_drawn(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    write_content(folder, case_content())
+    found = check_case(folder, find_start=False)
+    assert found.problems == ()
+    assert found.picture is not None
+    assert found.picture.shape[2] == 3
+    assert main(["check", str(folder), "--fast", "--out", str(tmp_path / "check.png")]) == 0
+    assert cv2.imread(str(tmp_path / "check.png")).shape == found.picture.shape
+    assert "tip starts 20 mm from the entry point" in capsys.readouterr().out
+    content = case_content()
+    content["side"] = "right"
+    write_content(folder, content)
+    assert main(["check", str(folder), "--fast", "--out", str(tmp_path / "check.png")]) == 1
+    assert "but `side` is right" in capsys.readouterr().out
+
+
+def test_swapped_bones_are_told(files: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    content = case_content()
+    ids = {"hip_left": 2, "hip_right": 1, "sacrum": 4, "femur_left": 6, "femur_right": 5}
+    content["ct"]["bones"] = ids
+    write_content(folder, content)
+    problems = check_case(folder, find_start=False).problems
+    assert any("hip_left lies to the right of hip_right" in one for one in problems)
+    assert any("femur_left lies to the right of femur_right" in one for one in problems)
+
+
+def test_the_registration_refuses_swapped_sides_and_tells_what_was_done_to_a_label_map(
+    files: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    write_content(folder, case_content())
+    image = nibabel.load(folder / "labels.nii.gz")
+    nibabel.save(image.slicer[2:, :, 1:], folder / "labels.nii.gz")
+    notes = prepare_scene(read_case(folder)).missing
+    assert any("labels.nii.gz has a grid of its own (4 × 4 × 4 mm): it was resampled" in note for note in notes)
+    swapped({}, folder)
+    with pytest.raises(InputError, match="landmarks: left and right are swapped"):
+        prepare_scene(read_case(folder))
+
+
+def test_what_is_no_case_is_told(tmp_path: Path) -> None:
+    assert "holds no case.yaml" in check_case(tmp_path).problems[0]
+    (tmp_path / "case.yaml").write_text("- a list")
+    assert "a mapping of keys and values was expected" in check_case(tmp_path).problems[0]
+
+
+def test_warnings_of_a_ct(files: Path) -> None:
+    ct = read_ct(files / "ct.nii.gz")
+    labels = read_label_map(files / "labels.nii.gz")
+    assert ct.data.shape == labels.data.shape
+    told = ct_warnings(ct)
+    assert any("coarse voxels (4 × 4 × 4 mm)" in one for one in told)
+    assert not any("air" in one or "cut" in one for one in told)
+    inner = ct.data[:, 15:35, 8:70].contiguous()
+    inner[:2] = -100  # fat
+    inside = type(ct)(inner, ct.lps_from_index)
+    told = ct_warnings(inside)
+    assert any("hardly any air" in one for one in told)
+    metal = ct.with_data(ct.data.clone())
+    metal.data[30:34, 20:24, 40:44] = 3000
+    assert any("metal" in one for one in ct_warnings(metal))
+    cut = type(ct)(ct.data[:, :, 20:].contiguous(), ct.lps_from_index)
+    assert any("bone is cut at the right face" in one for one in ct_warnings(cut))

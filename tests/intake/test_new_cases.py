@@ -1,0 +1,290 @@
+"""A case made of the files that users have: what it then holds, and that it appears whole or not at all."""
+
+from pathlib import Path
+from typing import Any
+
+import nibabel
+import numpy as np
+import pydicom
+import pytest
+import SimpleITK as sitk
+import torch
+import yaml
+from intake_files import ENTRY, HEAD, bones, landmarks, markups, ras_affine, write_files
+from pydicom.dataset import FileMetaDataset
+from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, XRayAngiographicImageStorage, generate_uid
+
+from femoreg_torch.case import read_case
+from femoreg_torch.commands.main import main
+from femoreg_torch.intake import inspect_path
+from femoreg_torch.volume import read_ct, read_labels
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `write_files` writes, and the same CT, bones and images in other forms."""
+    folder = write_files(tmp_path_factory.mktemp("user") / "files")
+    write_dicom_ct(folder / "dicom", folder / "ct.nii.gz")
+    (folder / "segmentations").mkdir()
+    for name, mask in bones().items():
+        nibabel.save(nibabel.Nifti1Image(mask.astype(np.uint8), ras_affine()), folder / f"segmentations/{name}.nii.gz")
+    (folder / "ras.stl").write_bytes(
+        b"3D Slicer output. SPACE=RAS".ljust(80) + (folder / "device.stl").read_bytes()[80:]
+    )
+    write_slicer_segmentation(folder / "bones.seg.nrrd", folder / "labels.nii.gz")
+    for kind in ("plain", "device"):
+        (folder / kind).mkdir()
+        for number in (1, 2, 3):
+            write_dicom_image(folder / kind / f"run{number}", number + (10 if kind == "device" else 0))
+    return folder
+
+
+def dataset(kind: str, modality: str, series: str) -> pydicom.Dataset:
+    meta = FileMetaDataset()
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    data = pydicom.Dataset()
+    data.file_meta = meta
+    data.SOPClassUID = meta.MediaStorageSOPClassUID = kind
+    data.SOPInstanceUID = meta.MediaStorageSOPInstanceUID = generate_uid()
+    data.SeriesInstanceUID, data.StudyInstanceUID, data.Modality, data.PatientID = series, "1.2", modality, "p"
+    data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 0
+    return data
+
+
+def write_dicom_ct(folder: Path, source: Path) -> None:
+    folder.mkdir()
+    image, series = sitk.DICOMOrient(sitk.ReadImage(str(source)), "LPS"), generate_uid()
+    values = sitk.GetArrayFromImage(image)
+    for k, plane in enumerate(values):
+        data = dataset(CTImageStorage, "CT", series)
+        data.Rows, data.Columns = plane.shape
+        data.RescaleSlope, data.RescaleIntercept = 1, -1024
+        data.PixelSpacing, data.ImageOrientationPatient = list(image.GetSpacing()[:2]), [1, 0, 0, 0, 1, 0]
+        data.ImagePositionPatient = list(image.TransformIndexToPhysicalPoint((0, 0, k)))
+        data.PixelData = (plane + 1024).astype("<u2").tobytes()
+        data.save_as(folder / f"{len(values) - k:03d}", enforce_file_format=True)
+
+
+def write_dicom_image(path: Path, seed: int) -> None:
+    data = dataset(XRayAngiographicImageStorage, "XA", generate_uid())
+    data.Rows, data.Columns = 48, 40
+    data.DistanceSourceToDetector, data.ImagerPixelSpacing = 1000, [4, 4]
+    data.PixelData = np.random.default_rng(seed).integers(1000, 50000, (48, 40)).astype("<u2").tobytes()
+    data.save_as(path, enforce_file_format=True)
+
+
+def write_slicer_segmentation(path: Path, source: Path) -> None:
+    image = sitk.ReadImage(str(source))
+    names = {1: "Left hip", 2: "Right hip", 4: "Sacrum", 5: "left femur", 6: "Femur_Right"}
+    for n, (value, name) in enumerate(names.items()):
+        for key, text in {"Name": name, "LabelValue": str(value), "Layer": "0"}.items():
+            image.SetMetaData(f"Segment{n}_{key}", text)
+    sitk.WriteImage(image, str(path), useCompression=True)
+
+
+def arguments(files: Path, out: Path, **changes: Any) -> list[str]:
+    """The command with DICOM, masks of TotalSegmentator and markups, but for `changes`; None leaves an option out."""
+    options: dict[str, Any] = {
+        "ct": files / "dicom",
+        "labels": files / "segmentations",
+        "landmarks": files / "landmarks.mrk.json",
+        "plan": files / "plan.mrk.json",
+        "device": files / "device.stl",
+        "device-points": files / "points.mrk.json",
+        "before-entry-mm": 25,
+        "images": [files / "plain"],
+        "device-images": [files / "device" / f"run{n}" for n in (1, 2, 3)],
+    }
+    words = ["new-case", str(out)]
+    for name, value in (options | {key.replace("_", "-"): value for key, value in changes.items()}).items():
+        if value is not None:
+            words += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
+    return words
+
+
+def test_a_case_from_two_dicom_folders(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments(files, tmp_path / "case")) == 0
+    told = capsys.readouterr().out
+    assert "the operated side is the left one" in told
+    assert "source to detector 1000 mm, pixels of 4 mm" in told
+    assert "view 2 is plain/run2, with the device device/run2" in told
+    case = read_case(tmp_path / "case")
+    assert case.side == "left"
+    assert case.plan is not None
+    torch.testing.assert_close(case.plan.entry_point, torch.tensor(ENTRY).double())
+    torch.testing.assert_close(case.plan.target, torch.tensor(HEAD).double())
+    assert {name: point.tolist() for name, point in case.landmarks.items()} == {
+        k: list(v) for k, v in landmarks().items()
+    }
+    assert case.carm.camera.sdd_mm == 1000
+    assert len(case.views) == 3
+    assert all(path.parent == tmp_path / "case" for view in case.views for path in view.images.values())
+    assert case.ct_path is not None
+    assert case.labels_path is not None
+    ct, plain = read_ct(case.ct_path), read_ct(files / "ct.nii.gz")
+    assert torch.equal(ct.data, plain.data)
+    torch.testing.assert_close(ct.lps_from_index, plain.lps_from_index, atol=1e-4, rtol=0)
+    labels = read_labels(case.labels_path, ct).data
+    for name, (number,) in case.bones.items():
+        assert np.array_equal((labels == number).numpy(), sitk_mask(files, name))
+    assert case.objects["device"].start.beside == "femur"
+
+
+def sitk_mask(files: Path, name: str) -> np.ndarray:
+    image = sitk.DICOMOrient(sitk.ReadImage(str(files / f"segmentations/{name}.nii.gz")), "LPS")
+    return sitk.GetArrayFromImage(image) > 0
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"ct": "ct.nii.gz", "labels": "labels.nii.gz", "bones": "femoreg"},
+        {"labels": "bones.seg.nrrd"},
+        {"device": None, "device_points": None, "device_images": None, "before_entry_mm": None},
+        {"material": "steel", "guide": "from the side", "turned_deg": 30, "side": "left"},
+        {
+            "carm": "carm.yaml",
+            "images": ["view1.png", "view2.png"],
+            "device_images": ["view1_device.png", "view2_device.png"],
+        },
+    ],
+    ids=["files", "3D Slicer", "no device", "words", "pictures"],
+)
+def test_other_forms_give_the_same_bones(files: Path, tmp_path: Path, changes: dict[str, Any]) -> None:
+    def standing(value: Any) -> Any:
+        if isinstance(value, list):
+            return [standing(one) for one in value]
+        return files / value if isinstance(value, str) and (files / value).exists() else value
+
+    assert main(arguments(files, tmp_path / "case", **{key: standing(value) for key, value in changes.items()})) == 0
+    case = read_case(tmp_path / "case")
+    assert case.ct_path is not None
+    assert case.labels_path is not None
+    labels = read_labels(case.labels_path, read_ct(case.ct_path)).data
+    for name, (number, *_) in case.bones.items():
+        if name != "vertebrae":
+            assert np.array_equal((labels == number).numpy(), sitk_mask(files, name))
+    content = yaml.safe_load((tmp_path / "case" / "case.yaml").read_text())
+    assert ("device" in content) == (changes.get("device", "") is not None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "messages"),
+    [
+        (
+            {"ct": None, "plan": None, "device_points": None},
+            ["--ct is missing", "--plan is missing", "--device-points is"],
+        ),
+        ({"labels": "none.nii.gz", "material": "steel", "hu": 3}, ["--labels: there is no", "--material and --hu"]),
+        ({"labels": "labels.nii.gz"}, ["--bones: is missing", "no shipped table fits"]),
+        ({"images": ["plain/run1"]}, ["3 files, but there are 1 images without the device"]),
+        ({"images": ["view1.png", "view2.png", "view3.png"]}, ["--carm: is missing, and view1.png is no DICOM file"]),
+        ({"guide": "upwards"}, ["guide: one of along the planned path"]),
+        ({"device": "ras.stl"}, ["says that it is in RAS"]),
+        ({"series": "7"}, ["none of its series is '7'"]),
+        ({"side": "right", "images": ["plain/run1"] * 3}, ["entry point lies on the femur_left", "the same image as"]),
+    ],
+)
+def test_what_is_wrong_is_told_at_once_and_nothing_is_written(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, Any], messages: list[str]
+) -> None:
+    def standing(value: Any) -> Any:
+        if isinstance(value, list):
+            return [files / one for one in value]
+        return files / value if isinstance(value, str) and "." in value else value
+
+    assert main(arguments(files, tmp_path / "case", **{key: standing(value) for key, value in changes.items()})) == 2
+    told = capsys.readouterr().err
+    assert all(message in told for message in messages), told
+    assert told.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_there_is_not_touched(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "case").mkdir()
+    (tmp_path / "case" / "mine").write_text("x")
+    assert main(arguments(files, tmp_path / "case")) == 2
+    assert "is there already" in capsys.readouterr().err
+    assert (tmp_path / "case" / "mine").read_text() == "x"
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "fact"),
+    [
+        ("dicom", "DICOM folder", "series ? (CT, 60 files)"),
+        ("ct.nii.gz", "CT", "80 × 52 × 60 voxels of 4 × 4 × 4 mm, along the patient's axes"),
+        ("labels.nii.gz", "label map", "labels: 1 ("),
+        ("bones.seg.nrrd", "label map", "bones by name: hip_left, hip_right, sacrum, femur_left, femur_right"),
+        ("segmentations", "label map", "bones by name: femur_left, femur_right, hip_left, hip_right, sacrum"),
+        ("landmarks.mrk.json", "landmarks of the hip", "FH-l: (110.00, 0.00, -40.00) mm LPS"),
+        ("plan.mrk.json", "points", "L-1: (148.00, 0.00, -70.00) mm LPS"),
+        ("device.stl", "mesh", "triangles, closed"),
+        ("view1.png", "image", "40 × 48 pixels"),
+        ("plain/run1", "DICOM image", "source to detector, mm: 1000"),
+    ],
+)
+def test_inspect_says_what_is_there(files: Path, name: str, kind: str, fact: str) -> None:
+    found = inspect_path(files / name)
+    assert found.kind == kind
+    assert any(fact in one for one in found.facts), found.facts
+    assert (found.picture is not None) == (kind in ("DICOM folder", "CT", "label map", "image", "DICOM image"))
+
+
+def test_inspect_warns_of_swapped_landmarks_and_unclear_headers(files: Path, tmp_path: Path) -> None:
+    other = {"l": "r", "r": "l"}
+    swapped = {name[:-1] + other[name[-1]]: point for name, point in landmarks().items()}
+    (tmp_path / "marks.mrk.json").write_text(markups(swapped))
+    assert "lie to the right of their partners" in inspect_path(tmp_path / "marks.mrk.json").warnings[0]
+    image = nibabel.load(files / "ct.nii.gz")
+    image.header.set_sform(None, 0)
+    image.header.set_qform(None, 0)
+    nibabel.Nifti1Image(np.asarray(image.dataobj), None, image.header).to_filename(tmp_path / "bare.nii.gz")
+    assert any("neither sform nor qform" in one for one in inspect_path(tmp_path / "bare.nii.gz").warnings)
+    moved = ras_affine()
+    moved[0, 3] += 5
+    image = nibabel.Nifti1Image(np.asarray(image.dataobj), ras_affine())
+    image.set_sform(ras_affine(), 2)
+    image.set_qform(moved, 1)
+    image.to_filename(tmp_path / "two.nii.gz")
+    assert any("disagree by up to 5.0 mm" in one for one in inspect_path(tmp_path / "two.nii.gz").warnings)
+
+
+def test_the_pictures_left_is_the_patients_right(files: Path) -> None:
+    """Axial plane: a bright block on the patient's left, in front, is drawn on the right, above the middle."""
+    values = np.full((20, 20, 20), -1000, np.int16)
+    values[14:18, 12:16, :] = 1000
+    path = files / "block.nii.gz"
+    nibabel.save(nibabel.Nifti1Image(values, np.diag([-10.0, 10.0, 10.0, 1.0])), path)  # in RAS: −x is left
+    picture = inspect_path(path).picture
+    assert picture is not None
+    axial = picture[:, : picture.shape[1] // 3].max(2)
+    rows, columns = np.nonzero(axial[40:-40] > 200)
+    assert columns.mean() > axial.shape[1] / 2
+    assert rows.mean() + 40 < axial.shape[0] / 2
+    path.unlink()
+
+
+def test_in_a_terminal_what_is_missing_is_asked_for(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    answers = iter(
+        [
+            str(files / "ct.nii.gz"),
+            str(files / "labels.nii.gz"),
+            "",  # landmarks cannot be left out: asked again
+            str(files / "landmarks.mrk.json"),
+            str(files / "plan.mrk.json"),
+            "",  # no device
+            f"{files / 'view1.png'} {files / 'view2.png'}",
+            "femoreg",
+            str(files / "carm.yaml"),
+        ]
+    )
+    monkeypatch.setattr("builtins.input", lambda *_: next(answers))
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    assert main(["new-case", str(tmp_path / "case")]) == 0, capsys.readouterr().err
+    assert next(answers, None) is None
+    case = read_case(tmp_path / "case")
+    assert len(case.views) == 2
+    assert "device" not in case.objects

@@ -1,0 +1,328 @@
+"""CTs and segmentations in DICOM, as pydicom and highdicom write them, against the points that their headers tell."""
+
+from pathlib import Path
+
+import highdicom
+import numpy as np
+import pydicom
+import pytest
+import SimpleITK as sitk
+import torch
+from highdicom.legacy import LegacyConvertedEnhancedCTImage
+from highdicom.seg import Segmentation, SegmentDescription
+from pydicom.dataset import FileMetaDataset
+from pydicom.sr.codedict import codes
+from pydicom.uid import (
+    CTImageStorage,
+    ExplicitVRBigEndian,
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
+    JPEGLSLossless,
+    RLELossless,
+    generate_uid,
+)
+from scipy.spatial.transform import Rotation
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.volume import (
+    Volume,
+    read_ct,
+    read_ct_told,
+    read_label_map,
+    read_labels_told,
+    read_volume,
+    segment_names,
+)
+from femoreg_torch.volume.dicom import series_in
+
+SIZE = (7, 9, 8)  # slices, rows, columns
+PIXEL, STEP_MM = (0.9, 0.8), 2.5  # row spacing, column spacing
+ORIGIN = np.array([-40.0, 13.0, 200.0])
+AXIAL = np.eye(3)
+NO_LEAN = np.zeros(3)
+OBLIQUE = Rotation.from_euler("xyz", [12, -8, 20], degrees=True).as_matrix()
+STUDY, FRAME = generate_uid(), generate_uid()
+VALUES = np.random.default_rng(3).integers(0, 3000, SIZE).astype(np.int16)  # HU + 1024
+
+
+def points_of(axes: np.ndarray, lean: np.ndarray) -> np.ndarray:
+    """Positions (slices, rows, columns, 3) of all voxels, LPS mm, by the formula of DICOM PS3.3, C.7.6.2.1.1."""
+    k, j, i = np.meshgrid(*(np.arange(n) for n in SIZE), indexing="ij")
+    step = STEP_MM * axes[:, 2] + lean
+    return ORIGIN + i[..., None] * PIXEL[1] * axes[:, 0] + j[..., None] * PIXEL[0] * axes[:, 1] + k[..., None] * step
+
+
+def write_series(
+    folder: Path,
+    axes: np.ndarray = AXIAL,
+    *,
+    lean: np.ndarray = NO_LEAN,
+    values: np.ndarray = VALUES,
+    slope: float = 1.0,
+    syntax: str = ExplicitVRLittleEndian,
+    number: int = 3,
+    description: str = "Hip 2.5 B60",
+    without: tuple[int, ...] = (),
+    **tags: object,
+) -> list[pydicom.Dataset]:
+    """A CT with a file for each slice, whose names run against the order of the slices."""
+    folder.mkdir(exist_ok=True)
+    uid, datasets = generate_uid(), []
+    for k in range(len(values)):
+        if k in without:
+            continue
+        meta = FileMetaDataset()
+        meta.TransferSyntaxUID = ExplicitVRLittleEndian if syntax in (RLELossless, JPEGLSLossless) else syntax
+        data = pydicom.Dataset()
+        data.file_meta = meta
+        data.SOPClassUID = meta.MediaStorageSOPClassUID = CTImageStorage
+        data.SOPInstanceUID = meta.MediaStorageSOPInstanceUID = generate_uid()
+        data.StudyInstanceUID, data.SeriesInstanceUID, data.FrameOfReferenceUID = STUDY, uid, FRAME
+        data.PatientID, data.PatientName, data.PatientBirthDate, data.PatientSex = "p", "Simulated^Hip", "", ""
+        data.StudyID, data.StudyDate, data.StudyTime, data.AccessionNumber = "1", "20260101", "120000", ""
+        data.ReferringPhysicianName, data.PositionReferenceIndicator = "", ""
+        data.Modality, data.SeriesNumber, data.SeriesDescription = "CT", number, description
+        data.InstanceNumber, data.ImageType = k + 1, ["ORIGINAL", "PRIMARY", "AXIAL"]
+        data.Rows, data.Columns = values.shape[1:]
+        data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+        data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 1
+        data.RescaleSlope, data.RescaleIntercept = slope, -1024
+        data.PixelSpacing, data.SliceThickness = list(PIXEL), STEP_MM
+        data.ImageOrientationPatient = [f"{v:.12f}" for v in (*axes[:, 0], *axes[:, 1])]
+        data.ImagePositionPatient = [f"{v:.10f}" for v in ORIGIN + k * (STEP_MM * axes[:, 2] + lean)]
+        order = ">i2" if syntax == ExplicitVRBigEndian else "<i2"
+        data.PixelData = values[k].astype(order).tobytes()
+        data["PixelData"].VR = "OW"
+        for tag, value in tags.items():
+            setattr(data, tag, value)
+        if syntax in (RLELossless, JPEGLSLossless):
+            data.compress(syntax)
+        data.save_as(folder / f"IM{100 + number * 50 - k:04d}", enforce_file_format=True)
+        datasets.append(data)
+    return datasets
+
+
+def sampled(volume: Volume, points: np.ndarray) -> np.ndarray:
+    """Values at points (..., 3) that lie on voxel centres."""
+    index = np.einsum(
+        "ij,...j->...i",
+        np.linalg.inv(volume.lps_from_index.numpy()),
+        np.concatenate([points, np.ones((*points.shape[:-1], 1))], -1),
+    )[..., :3]
+    assert abs(index - np.rint(index)).max() < 1e-4
+    x, y, z = np.moveaxis(np.rint(index).astype(int), -1, 0)
+    return volume.data.numpy()[z, y, x]
+
+
+@pytest.mark.parametrize(
+    "syntax",
+    [ExplicitVRLittleEndian, ImplicitVRLittleEndian, ExplicitVRBigEndian, RLELossless, JPEGLSLossless],
+    ids=["explicit", "implicit", "big-endian", "RLE", "JPEG-LS"],
+)
+def test_every_voxel_of_an_oblique_series_is_in_its_place(tmp_path: Path, syntax: str) -> None:
+    write_series(tmp_path / "ct", OBLIQUE, syntax=syntax)
+    volume, told = read_ct_told(tmp_path / "ct")
+    assert told == ()
+    np.testing.assert_array_equal(sampled(volume, points_of(OBLIQUE, NO_LEAN)), VALUES - 1024)
+
+
+@pytest.mark.parametrize(
+    "axes",
+    [AXIAL, np.stack([-AXIAL[0], -AXIAL[1], AXIAL[2]], 1), np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])],
+    ids=["supine", "prone", "sagittal"],
+)
+def test_index_axes_end_along_left_back_and_head(tmp_path: Path, axes: np.ndarray) -> None:
+    write_series(tmp_path / "ct", axes)
+    volume = read_ct(tmp_path / "ct")
+    assert (volume.lps_from_index[:3, :3].diagonal() > 0.5).all()
+    np.testing.assert_array_equal(sampled(volume, points_of(axes, NO_LEAN)), VALUES - 1024)
+
+
+@pytest.mark.parametrize("compressor", ["JPEG", "JPEG2000", "JPEGLS"])
+def test_series_that_gdcm_compressed(tmp_path: Path, compressor: str) -> None:
+    """Lossless JPEG, JPEG 2000 and JPEG-LS, as SimpleITK writes them; headers then as pydicom writes them."""
+    folder = tmp_path / "ct"
+    for number, data in enumerate(write_series(folder, OBLIQUE)):
+        path = folder / f"IM{250 - number:04d}"
+        writer = sitk.ImageFileWriter()
+        writer.KeepOriginalImageUIDOn()
+        writer.UseCompressionOn()
+        writer.SetCompressor(compressor)
+        writer.SetImageIO("GDCMImageIO")
+        image = sitk.Cast(sitk.ReadImage(str(path)), sitk.sitkInt16)
+        writer.SetFileName(str(tmp_path / "one.dcm"))
+        writer.Execute(image)
+        packed = pydicom.dcmread(tmp_path / "one.dcm")
+        assert packed.file_meta.TransferSyntaxUID.is_compressed
+        packed.SeriesInstanceUID, packed.SOPInstanceUID = data.SeriesInstanceUID, data.SOPInstanceUID
+        packed.ImagePositionPatient, packed.PixelSpacing = data.ImagePositionPatient, data.PixelSpacing
+        packed.ImageOrientationPatient = data.ImageOrientationPatient
+        packed.save_as(path)
+    np.testing.assert_array_equal(sampled(read_ct(folder), points_of(OBLIQUE, NO_LEAN)), VALUES - 1024)
+
+
+def test_an_enhanced_ct_in_one_file(tmp_path: Path) -> None:
+    slices = write_series(tmp_path / "ct", OBLIQUE)
+    for data in slices:
+        data.KVP, data.ContrastBolusAgent, data.BodyPartExamined = 120, "", "HIP"
+    whole = LegacyConvertedEnhancedCTImage(
+        legacy_datasets=slices,
+        series_instance_uid=generate_uid(),
+        series_number=7,
+        sop_instance_uid=generate_uid(),
+        instance_number=1,
+    )
+    (tmp_path / "enhanced").mkdir()
+    whole.save_as(tmp_path / "enhanced" / "one.dcm")
+    volume = read_ct(tmp_path / "enhanced")
+    np.testing.assert_array_equal(sampled(volume, points_of(OBLIQUE, NO_LEAN)), VALUES - 1024)
+
+
+def test_fractional_rescale(tmp_path: Path) -> None:
+    write_series(tmp_path / "ct", slope=0.25, values=4 * VALUES)
+    np.testing.assert_array_equal(sampled(read_ct(tmp_path / "ct"), points_of(AXIAL, NO_LEAN)), VALUES - 1024)
+
+
+def test_a_tilted_gantry_is_straightened(tmp_path: Path) -> None:
+    """A linear function of space, sampled in sheared slices, comes back as that function."""
+    tilt = np.radians(15)
+    axes = Rotation.from_euler("x", tilt).as_matrix()
+    lean = STEP_MM * (np.array([0, 0, 1 / np.cos(tilt)]) - axes[:, 2])  # the table moves along z
+    points = points_of(axes, lean)
+    values = np.rint(500 + 40 * (points - ORIGIN) @ [1.0, 2.0, 1.5]).astype(np.int16)
+    write_series(tmp_path / "ct", axes, lean=lean, values=values)
+    volume, told = read_ct_told(tmp_path / "ct")
+    assert "tilted by 15.0°" in told[0]
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in volume.data.shape[::-1]), indexing="ij"), -1).reshape(-1, 3)
+    where = index @ volume.lps_from_index[:3, :3].numpy().T + volume.lps_from_index[:3, 3].numpy()
+    found = volume.data.numpy()[tuple(index[:, ::-1].T)]
+    height = (where - ORIGIN) @ axes[:, 2] / STEP_MM
+    stored = (where - ORIGIN - height[:, None] * lean) @ axes / [PIXEL[1], PIXEL[0], STEP_MM]
+    inside = ((stored > -1e-6) & (stored < np.array(SIZE[::-1]) - 1 + 1e-6)).all(1)
+    assert inside.sum() > 0.8 * values.size
+    assert (found[(stored < -0.6).any(1)] == -1024).all()
+    np.testing.assert_allclose(found[inside], (500 - 1024 + 40 * (where - ORIGIN) @ [1.0, 2.0, 1.5])[inside], atol=1)
+
+
+def test_one_of_several_series_is_chosen(tmp_path: Path) -> None:
+    folder = tmp_path / "dicom"
+    write_series(folder, number=3)
+    write_series(folder, number=5, description="Hip 1.0 B30", values=VALUES[::-1].copy())
+    write_series(folder, number=1, description="Topogram", values=VALUES[:1], ImageType=["ORIGINAL", "LOCALIZER"])
+    (folder / "README.txt").write_text("of the scanner")
+    assert [(one.number, len(one.slices)) for one in series_in(folder)] == [("1", 1), ("3", 7), ("5", 7)]
+    with pytest.raises(InputError, match=r"holds 2 DICOM series.*series 3 “Hip 2.5 B60” \(CT, 7 files\), series 5"):
+        read_ct(folder)
+    for wanted in ("5", "1.0 b30"):
+        assert read_ct_told(folder, wanted)[0].data[0, 0, 0] == VALUES[-1, 0, 0] - 1024
+    assert read_ct(folder / "IM0250").data[0, 0, 0] == VALUES[0, 0, 0] - 1024  # a file stands for its series
+    with pytest.raises(InputError, match="none of its series is '7'; there are: series 1"):
+        read_ct_told(folder, "7")
+
+
+def test_a_scout_beside_one_series_is_passed_over_and_copies_count_once(tmp_path: Path) -> None:
+    folder = tmp_path / "dicom"
+    write_series(folder, number=3)
+    write_series(folder, number=1, values=VALUES[:1], ImageType=["ORIGINAL", "LOCALIZER"])
+    (folder / "copy").write_bytes((folder / "IM0250").read_bytes())
+    assert read_ct(folder).data.shape == SIZE
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("missing", r"2 of 7 slices are missing \(after IM0249, IM0247\), at steps of 2.5 mm"),
+        ("doubled", r"7 slices from 2 acquisitions lie where another one lies"),
+        ("uneven", "the slices are 2 to 2.5 mm apart"),
+        ("sizes", "slices of several sizes"),
+        ("turned", "another orientation or pixel spacing"),
+        ("no position", "1 slices have no ImagePositionPatient"),
+        ("one", "none of its DICOM series is a volume"),
+        ("beside", "beside one straight line"),
+        ("not HU", "Hounsfield"),
+    ],
+)
+def test_series_that_are_no_ct_are_told(tmp_path: Path, kind: str, message: str) -> None:
+    folder = tmp_path / "ct"
+    slices = write_series(
+        folder, without=(2, 4) if kind == "missing" else (), values=VALUES[:1] if kind == "one" else VALUES
+    )
+    last = folder / "IM0244"
+    if kind == "doubled":
+        for n, data in enumerate(slices):
+            data.AcquisitionNumber, data.SOPInstanceUID = 2, generate_uid()
+            data.save_as(folder / f"second_{n}")
+    elif kind in ("uneven", "turned", "no position", "beside"):
+        data = slices[-1]
+        x, y, z = (float(v) for v in data.ImagePositionPatient)
+        if kind == "uneven":
+            data.ImagePositionPatient = [x, y, z - 0.5]
+        elif kind == "beside":
+            slices[3].ImagePositionPatient = [x, y + 3, ORIGIN[2] + 3 * STEP_MM]
+            slices[3].save_as(folder / "IM0247")
+        elif kind == "turned":
+            data.ImageOrientationPatient = [1, 0, 0, 0, 0.9962, 0.0872]
+        else:
+            del data.ImagePositionPatient
+        data.save_as(last)
+    elif kind == "sizes":
+        slices[0].Rows, slices[0].PixelData = 8, slices[0].PixelData[:128]
+        slices[0].save_as(folder / "IM0250")
+    elif kind == "not HU":
+        for n, data in enumerate(slices):
+            data.RescaleIntercept = 0
+            data.save_as(folder / f"IM{250 - n:04d}")
+    with pytest.raises(InputError, match=message) as raised:
+        read_ct(folder)
+    assert "\n" not in str(raised.value)
+
+
+def described(number: int, label: str) -> SegmentDescription:
+    return SegmentDescription(
+        segment_number=number,
+        segment_label=label,
+        segmented_property_category=codes.SCT.Tissue,
+        segmented_property_type=codes.SCT.Bone,
+        algorithm_type=highdicom.seg.SegmentAlgorithmTypeValues.MANUAL,
+    )
+
+
+@pytest.mark.parametrize("kind", ["BINARY", "FRACTIONAL", "LABELMAP"])
+def test_dicom_segmentations(tmp_path: Path, kind: str) -> None:
+    """Two bones on an oblique CT; the segmentation holds only those slices that are not empty."""
+    slices = write_series(tmp_path / "ct", OBLIQUE)
+    masks = np.zeros((*SIZE, 2), np.uint8)
+    masks[2:5, 1:4, 1:6, 0], masks[3:6, 5:, 2:, 1] = 1, 1
+    shared = kind != "LABELMAP"
+    if shared:
+        masks[3, 3:6, 2:4, 1] = 1
+    pixels = masks if shared else masks[..., 0] + 2 * masks[..., 1]
+    seg = Segmentation(
+        source_images=slices,
+        pixel_array=pixels.astype(float) if kind == "FRACTIONAL" else pixels,
+        segmentation_type=kind,
+        segment_descriptions=[described(1, "Left femur"), described(2, "Left hip")],
+        series_instance_uid=generate_uid(),
+        series_number=9,
+        sop_instance_uid=generate_uid(),
+        instance_number=1,
+        manufacturer="test",
+        manufacturer_model_name="test",
+        software_versions="1",
+        device_serial_number="1",
+    )
+    path = tmp_path / "bones.dcm"
+    seg.save_as(path)
+    assert segment_names(path) == {"Left femur": (1,), "Left hip": (2,)}
+    ct = read_volume(tmp_path / "ct")
+    labels, told = read_labels_told(path, ct)
+    expected = np.where(masks[..., 0] > 0, 1, 2 * masks[..., 1])
+    np.testing.assert_array_equal(sampled(labels, points_of(OBLIQUE, NO_LEAN)), expected)
+    assert any("lie in both Left femur and Left hip" in line for line in told) == shared
+    assert labels.data.dtype in (torch.uint8, torch.int32)
+
+
+def test_a_ct_is_no_segmentation(tmp_path: Path) -> None:
+    write_series(tmp_path / "ct")
+    with pytest.raises(InputError, match=r"a DICOM segmentation \(SEG\) was expected, found CT"):
+        read_label_map(tmp_path / "ct" / "IM0250")
