@@ -25,19 +25,19 @@ from femoreg_torch.case.model import Case, Side, View
 from femoreg_torch.case.models import MODEL_KEYS, read_model
 from femoreg_torch.case.objects import check_guide, checked_path
 from femoreg_torch.case.parts import (
+    VIEW_KEYS,
     read_bones,
     read_carm,
-    read_field,
-    read_intensity,
-    read_known_pose,
+    read_display,
     read_truth,
+    view_of,
     with_known_poses,
 )
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume import read_landmarks
 
 SIDES: tuple[Side, ...] = ("left", "right")
-_KEYS = ("version", "side", "ct", "landmarks", "plan", "device", "carm", "views", "truth")
+_KEYS = ("version", "side", "ct", "landmarks", "plan", "device", "carm", "display", "views", "truth")
 _STRUCTURES = (PELVIS, *(operated_femur(side) for side in SIDES))
 
 
@@ -95,9 +95,10 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
     device = _device(top.mapping("device"), folder) if "device" in top else None
     objects = femoroplasty_objects(side, landmarks[head], device)
     plan = top.mapping("plan").only("entry_point", "target")
+    display = read_display(top)
     return Case(
         folder=folder,
-        carm=read_carm(top),
+        carm=read_carm(top, display, views),
         objects=objects,
         views=with_known_poses(views, top),
         anatomy=HIP,
@@ -109,6 +110,7 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
         truth=read_truth(top, folder, list(objects), len(views)),
         template=TEMPLATE,
         side=side,
+        display=display,
     )
 
 
@@ -137,8 +139,8 @@ def _device(device: Fields, folder: Path) -> Device:
 
 
 def _view(view: Fields, folder: Path) -> View:
-    view.only(ANATOMY_IMAGES, DEVICE_IMAGES, "intensity", "camera_from_camera1", "field")
+    view.only(ANATOMY_IMAGES, DEVICE_IMAGES, *VIEW_KEYS)
     images = {ANATOMY_IMAGES: view.file_path(ANATOMY_IMAGES, folder)}
     if DEVICE_IMAGES in view:
         images[DEVICE_IMAGES] = view.file_path(DEVICE_IMAGES, folder)
-    return View(images, read_intensity(view), read_known_pose(view), read_field(view, folder))
+    return view_of(images, view, folder)
