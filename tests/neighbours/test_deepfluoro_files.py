@@ -62,7 +62,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for name, dtype in (("vol", np.float32), ("vol-seg/image", np.uint8)):
             group[f"{name}/dir-mat"], group[f"{name}/origin"] = np.eye(3), np.array([[1.0], [2.0], [3.0]])
             group[f"{name}/spacing"] = np.array([[1.0], [1.0], [2.0]])
-            group[f"{name}/pixels"] = np.arange(24).reshape(4, 3, 2).astype(dtype)
+            group[f"{name}/pixels"] = np.arange(240).reshape(8, 6, 5).astype(dtype)
         for name in HIP.landmark_names:
             group[f"vol-landmarks/{name}"] = FH.reshape(3, 1).astype(np.float32)
         for number, turned in (("000", 0), ("001", 1)):
@@ -82,7 +82,7 @@ def test_the_full_resolution_file(full: Path) -> None:
     assert is_full_resolution(full)
     assert specimens(full) == ["17-1882"]
     specimen = read_specimen(full, "17-1882")
-    assert specimen.ct.data.shape == (4, 3, 2)
+    assert specimen.ct.data.shape == (8, 6, 5)
     assert (specimen.ct.lps_from_index @ torch.tensor([1.0, 1, 1, 1], dtype=torch.float64)).tolist() == [2, 3, 5, 1]
     plain, turned = read_pictures(full, "17-1882")
     assert (plain.display, turned.display) == (Display("posterior"), Display("posterior", turned_deg=180))

@@ -38,9 +38,9 @@ def pose_of(display: Display) -> torch.Tensor:
     return exp_se3(torch.tensor([0.1, -0.2, 0.15, 3, 2, -9], dtype=float64)) @ turn
 
 
-def stored_pixels(display: Display) -> torch.Tensor:
+def stored_pixels(display: Display, points: torch.Tensor = POINTS) -> torch.Tensor:
     """Where the points lie in the picture as it is stored, by this project's own projection."""
-    seen = project_points(CAMERA, transform_points(pose_of(display), POINTS))
+    seen = project_points(CAMERA, transform_points(pose_of(display), points))
     return display.pixels_to_stored(seen, CAMERA)
 
 
@@ -106,8 +106,9 @@ def test_diffdrr_sees_the_points_on_the_same_pixels(orientation: str) -> None:
     carm = detector.Detector(stored.sdd_mm, rows, columns, column_mm, row_mm, x0, y0, whole, reverse_x_axis=True)
     pose = to_diffdrr(pose_of(display), display, MIDDLE, orientation)
     source, target = carm(rigid(pose.float()[None]), None)
-    ras = (POINTS - MIDDLE) * torch.tensor([-1.0, -1, 1], dtype=float64)
-    for point, place in zip(ras, stored_pixels(display), strict=True):
+    near = MIDDLE + 0.4 * (POINTS - MIDDLE)  # all of them on the detector
+    ras = (near - MIDDLE) * torch.tensor([-1.0, -1, 1], dtype=float64)
+    for point, place in zip(ras, stored_pixels(display, near), strict=True):
         column, row = place.round().int().tolist()
         ray = target[0, row * columns + column].double() - source[0, 0].double()
         off = torch.linalg.cross(ray / ray.norm(), point - source[0, 0].double()).norm().item()
