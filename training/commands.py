@@ -63,7 +63,8 @@ def measure(
     share of right landmarks over their confidence.
 
     Args:
-        images: files of labelled images (safetensors), one per patient, that `femoreg labelled-images` made.
+        images: files of labelled images (safetensors), one per patient, that `femoreg labelled-images` made; or HDF5
+            files of the public DeepFluoro data set, in either layout.
         out: folder of the results.
         weights: network weights (safetensors); by default the shipped ones.
         register: one folder per file, in the same order, with the ct.nii.gz, labels.nii.gz and landmarks.json that the

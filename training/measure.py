@@ -13,9 +13,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from femoreg_torch.anatomy import HIP
-from femoreg_torch.detect import Detection, LandmarkNetwork, detect
+from femoreg_torch.detect import Detection, LandmarkNetwork, as_stored, detect
 from femoreg_torch.detect.tta import AUGMENTATIONS, Augmentation
 from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import rotation_angle, transform_points
 from femoreg_torch.registration.start import find_start
 from training.augmentation import inside
@@ -50,14 +51,23 @@ def read_images(
     register: Registration | None = None,
 ) -> list[Reading]:
     """Detect in each image, find its start pose where enough landmarks are in it, and then `register` it."""
-    return [_read(detect(network, image.attenuation, image.camera, augmentations), image, register) for image in images]
+    return [_read(_look(network, image, augmentations), image, register) for image in images]
+
+
+def _look(network: LandmarkNetwork, image: LabelledImage, augmentations: tuple[Augmentation, ...]) -> Detection:
+    """What the network sees; it is shown the patient's left on the right."""
+    if not image.display.left_on_left:
+        return detect(network, image.attenuation, image.camera, augmentations)
+    camera = image.camera.mirrored()
+    found = detect(network, image.attenuation.flip(-1), camera, augmentations)
+    return as_stored(found, Display(mirrored=True), camera)
 
 
 def _read(detection: Detection, image: LabelledImage, register: Registration | None) -> Reading:
     pixel_mm = torch.tensor(image.camera.pixel_mm[::-1], dtype=torch.float64)
     error = ((detection.pixels - image.landmarks) * pixel_mm).norm(dim=1)
     there = image.visible & inside(image.landmarks, image.camera.shape)
-    asked = int(there.sum()) >= _LEAST_VISIBLE
+    asked = image.posed and int(there.sum()) >= _LEAST_VISIBLE
     start = _start(detection, image) if asked else None
     registered = register(image, start) if register is not None and start is not None else None
     return Reading(
@@ -90,7 +100,9 @@ def _start(detection: Detection, image: LabelledImage) -> Tensor | None:
     """The start pose (4, 4); None if it is refused."""
     landmarks = dict(zip(HIP.landmark_names, image.points, strict=True))
     try:
-        return find_start(landmarks, detection, image.attenuation, image.camera, image.outline, HIP).camera_from_ct
+        return find_start(
+            landmarks, detection, image.attenuation, image.camera, image.outline, HIP, beam=image.display.beam
+        ).camera_from_ct
     except InputError:
         return None
 

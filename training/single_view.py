@@ -1,5 +1,6 @@
 """What single-view registration makes of a start pose: the first stages of a preset on one labelled image."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from femoreg_torch.case.model import Side
 from femoreg_torch.geometry import load_carm, transform_points
 from femoreg_torch.registration import Scene, load_plan, run_plan
 from femoreg_torch.registration.prepare import ct_objects
-from femoreg_torch.volume import bone_labels, read_ct, read_labels, read_landmarks
+from femoreg_torch.volume import BoneLabels, Volume, bone_labels, read_ct, read_labels, read_landmarks
 from sim.study.capture import first_stages
 from training.labelled import LabelledImage
 from training.measure import Registration
@@ -22,16 +23,23 @@ _SIDES: tuple[Side, ...] = ("left", "right")
 
 
 def single_view_registration(folder: Path, preset: str) -> Registration:
-    """A function from an image and a start pose (4, 4) to the pose of the pelvis after the preset's first-view stages.
+    """The `registration_of` the patient whose ct.nii.gz, labels.nii.gz and landmarks.json are in `folder`.
 
-    `folder` holds ct.nii.gz, labels.nii.gz and landmarks.json of the patient. The femur that lies nearer to the middle
-    of the image is drawn and registered with the pelvis. Raises `InputError` for what cannot be read.
+    Raises `InputError` for what cannot be read.
     """
     ct = read_ct(folder / "ct.nii.gz")
     labels = read_labels(folder / "labels.nii.gz", ct)
     landmarks = read_landmarks(folder / "landmarks.json")
+    return registration_of(ct, bone_labels(labels, ct, label_table(_LABELS), HIP, landmarks), landmarks, preset)
+
+
+def registration_of(ct: Volume, bones: BoneLabels, landmarks: Mapping[str, Tensor], preset: str) -> Registration:
+    """A function from an image and a start pose (4, 4) to the pose of the pelvis after the preset's first-view stages.
+
+    The femur that lies nearer to the middle of the image is drawn and registered with the pelvis. `ct` is in HU,
+    `landmarks` (3,) in LPS mm.
+    """
     heads = {side: landmarks[femoral_head(side)] for side in _SIDES}
-    bones = bone_labels(labels, ct, label_table(_LABELS), HIP, landmarks)
     objects = {
         side: ct_objects(ct, bones, list(femoroplasty_objects(side, head, None).values()), HIP, (ANATOMY_IMAGES,))
         for side, head in heads.items()

@@ -18,6 +18,7 @@ from femoreg_torch.beads.model import Beads
 from femoreg_torch.beads.spots import find_spots
 from femoreg_torch.case import Case
 from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Poses, invert_rigid, project_points, transform_points
 from femoreg_torch.registration.prepare import ByKind, read_images
 
@@ -48,6 +49,11 @@ def measure(case: Case, given: Given, rough: Poses | None = None, report: Report
     """
     if not case.views:
         raise InputError(f"{case.folder}/case.yaml, views: empty. At least one fluoroscopic image is needed.")
+    if any(case.display_of(n) != Display() or view.grid is not None for n, view in enumerate(case.views)):
+        raise InputError(
+            f"{case.folder}/case.yaml: beads are measured in straight images as a source in front of the patient sees "
+            "them. Store the images so, and leave `display` and `grid` out."
+        )
     report("reading the images")
     images, fields, _ = read_images(case)
     worker = _Matcher(case, given, rough, images, fields)

@@ -106,13 +106,13 @@ def _clean_view(folder: Path, out: Path, case: Case, found: Measured, number: in
     view, images = case.views[number], {}
     for kind, path in view.images.items():
         centres, radii = _shadows(case, found, number, kind)
-        image = image_without(read_image(path), centres, radii, case.carm.camera)
-        if view.intensity != "raw" or image.min() < 0 or image.max() > 65535:
+        image = image_without(read_image(path, view.frames), centres, radii, case.carm.camera)
+        if view.intensity == "log" or image.min() < 0 or image.max() > 65535:
             raise InputError(f"{path}: raw images of 16 bits are written without beads; this one is none.")
         name = f"view{number + 1}_{kind}.tif"
         write_image(folder / name, image.round().to(torch.uint16))
         images[kind] = out / name
-    return replace(view, images=images)
+    return replace(view, images=images, frames=None)
 
 
 def _shadows(case: Case, found: Measured, number: int, kind: str) -> tuple[Tensor, Tensor]:

@@ -27,12 +27,12 @@ from femoreg_torch.case.models import MODEL_KEYS, read_model
 from femoreg_torch.case.nominal import ALONG_PATH, NominalPlace, bone_from_device
 from femoreg_torch.case.objects import check_guide, checked_path, plan_points
 from femoreg_torch.case.parts import (
+    VIEW_KEYS,
     read_bones,
     read_carm,
-    read_field,
-    read_intensity,
-    read_known_pose,
+    read_display,
     read_truth,
+    view_of,
     with_known_poses,
 )
 from femoreg_torch.errors import InputError
@@ -40,8 +40,7 @@ from femoreg_torch.settings import read_record
 from femoreg_torch.volume import read_landmarks, read_path_points
 
 SIDES: tuple[Side, ...] = ("left", "right")
-KEYS = ("version", "side", "ct", "landmarks", "plan", "device", "carm", "views", "truth")
-VIEW_KEYS = (ANATOMY_IMAGES, DEVICE_IMAGES, "intensity", "camera_from_camera1", "field")
+KEYS = ("version", "side", "ct", "landmarks", "plan", "device", "carm", "display", "views", "truth")
 DEVICE_STARTS = (f"camera1_from_{DEVICE}", f"{FEMUR}_from_{DEVICE}", "start")
 _STRUCTURES = (PELVIS, *(operated_femur(side) for side in SIDES))
 
@@ -96,14 +95,15 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
     landmarks = read_landmarks(top.file_path("landmarks", folder))
     if head not in landmarks:
         raise InputError(f"{top.where('landmarks')}: {head}, the head of the operated femur, is missing.")
-    views = tuple(_view(view, folder) for view in top.mappings("views")) if "views" in top else ()
+    views = tuple(read_view(view, folder) for view in top.mappings("views")) if "views" in top else ()
     entry_point, target, file = read_path(top, folder, landmarks, side)
     path = checked_path(planned(side, entry_point, target, None), top.where("plan"))
     device = read_device(top.mapping("device"), folder, path, side) if "device" in top else None
     objects = femoroplasty_objects(side, landmarks[head], device)
+    display = read_display(top)
     return Case(
         folder=folder,
-        carm=read_carm(top),
+        carm=read_carm(top, display, views),
         objects=objects,
         views=with_known_poses(views, top),
         anatomy=HIP,
@@ -115,6 +115,7 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
         truth=read_truth(top, folder, list(objects), len(views)),
         template=TEMPLATE,
         side=side,
+        display=display,
     )
 
 
@@ -189,9 +190,10 @@ def read_device_start(device: Fields, folder: Path, path: PlannedPath, side: Sid
     return Start(beside=FEMUR, beside_from_object=bone_from_device(place, path, side, points))
 
 
-def _view(view: Fields, folder: Path) -> View:
-    view.only(*VIEW_KEYS)
+def read_view(view: Fields, folder: Path) -> View:
+    """A view with images by kind, and what else is told of it. Raises `InputError`."""
+    view.only(ANATOMY_IMAGES, DEVICE_IMAGES, *VIEW_KEYS)
     images = {ANATOMY_IMAGES: view.file_path(ANATOMY_IMAGES, folder)}
     if DEVICE_IMAGES in view:
         images[DEVICE_IMAGES] = view.file_path(DEVICE_IMAGES, folder)
-    return View(images, read_intensity(view), read_known_pose(view), read_field(view, folder))
+    return view_of(images, view, folder)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import Anatomy, LabelTable
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import Circle, Polygon
+from femoreg_torch.fluoro import Circle, Display, Frames, GridImage, Polygon
 from femoreg_torch.geometry import CArm, Poses
 from femoreg_torch.volume.materials import material_hu
 
@@ -127,9 +127,12 @@ class View:
     """The images of one C-arm pose, by kind."""
 
     images: dict[str, Path]
-    intensity: Intensity = "raw"
+    intensity: Intensity | None = "raw"  # None: what the files say
     camera_from_camera1: Tensor | None = None  # (4, 4) where the C-arm's pose is known
     field: Circle | Polygon | Path | None = None  # what shutters leave of all its images, or a mask; None: looked for
+    frames: Frames | None = None  # of all its images, where they are cine runs
+    display: Display | None = None  # where it is another one than the case's
+    grid: GridImage | None = None  # of an image intensifier, at this pose of the C-arm
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +140,7 @@ class Case:
     """One procedure. Points are mm, all tensors float64."""
 
     folder: Path
-    carm: CArm
+    carm: CArm  # of images as the source sees them, head up
     objects: dict[str, CaseObject]  # in order; the C-arm's poses are told by where the first one is
     views: tuple[View, ...] = ()
     anatomy: Anatomy | None = None  # the body part, where it is a known one
@@ -149,6 +152,11 @@ class Case:
     truth: Poses | None = None
     template: str | None = None  # what `case.yaml` is a short form of
     side: Side | None = None  # operated side, where the template has one
+    display: Display = dataclasses.field(default_factory=Display)  # of the images as they are stored
+
+    def display_of(self, view: int) -> Display:
+        """How the images of a view (from 0) are stored."""
+        return self.views[view].display or self.display
 
     @property
     def kinds(self) -> tuple[str, ...]:

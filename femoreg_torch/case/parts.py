@@ -1,5 +1,7 @@
 """The parts of `case.yaml` that every form of a case has: anatomy, label table, C-arm, views, truth."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,11 +15,13 @@ from femoreg_torch.case.model import Intensity, View
 from femoreg_torch.case.poses import poses_from
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json
-from femoreg_torch.fluoro import Circle, Polygon
+from femoreg_torch.fluoro import SOURCES, TURNS, Circle, Display, Frames, GridImage, Polygon, Source, carm_settings
 from femoreg_torch.geometry import CArm, Poses, carm_from_dict, load_carm
 from femoreg_torch.volume import has_names, segment_names
 
 ONE_KIND = "image"  # the kind of images where a view has one alone
+VIEW_KEYS = ("intensity", "camera_from_camera1", "field", "frames", "display", "grid")  # what every view may say
+_TAGS = "dicom"  # in place of a C-arm: what the header of the first image says
 
 
 def read_anatomy_and_bones(top: Fields, folder: Path) -> tuple[Anatomy | None, LabelTable]:
@@ -101,12 +105,26 @@ def _checked_table(table: LabelTable, anatomy: Anatomy | None, where: str) -> La
     return table
 
 
-def read_carm(top: Fields) -> CArm:
-    """The C-arm under `carm`: a preset's name, a YAML file beside `case.yaml`, or its settings."""
-    value: Any = top.value("carm", "the name of a C-arm preset, a YAML file, or {sdd_mm, pixel_mm, shape}")
+def read_carm(top: Fields, display: Display, views: Sequence[View]) -> CArm:
+    """The C-arm under `carm`: a preset's name, a YAML file beside `case.yaml`, its settings, or `dicom`.
+
+    What it says of pixels is of the images as they are stored; the C-arm that is returned is of those that the source
+    sees. `dicom` stands for what the header of the first image says.
+    """
+    stored = _stored_carm(top, views)
+    return replace(stored, camera=display.camera(stored.camera))
+
+
+def _stored_carm(top: Fields, views: Sequence[View]) -> CArm:
+    expected = "the name of a C-arm preset, a YAML file, {sdd_mm, pixel_mm, shape}, or dicom"
+    value: Any = top.value("carm", expected)
     if isinstance(value, dict):
         return carm_from_dict(value, top.where("carm"))
-    name = top.text("carm", "the name of a C-arm preset, a YAML file, or {sdd_mm, pixel_mm, shape}")
+    name = top.text("carm", expected)
+    if name == _TAGS:
+        if not views:
+            raise InputError(f"{top.where('carm')}: there is no image to tell it. Name a preset, or give its settings.")
+        return carm_from_dict(carm_settings(next(iter(views[0].images.values()))), top.where("carm"))
     try:
         return load_carm(str(Path(top.file).parent / name) if name.endswith((".yaml", ".yml")) else name)
     except InputError as error:
@@ -115,7 +133,7 @@ def read_carm(top: Fields) -> CArm:
 
 def read_view(view: Fields, folder: Path) -> View:
     """A view with `image`, or with `images` by kind."""
-    view.only("image", "images", "intensity", "camera_from_camera1", "field")
+    view.only("image", "images", *VIEW_KEYS)
     if "images" in view and "image" in view:
         raise InputError(f"{view.where('image')}: `images` is given too. Keep one of the two.")
     if "images" in view:
@@ -125,7 +143,63 @@ def read_view(view: Fields, folder: Path) -> View:
         images = {ONE_KIND: view.file_path("image", folder)}
     if not images:
         raise InputError(f"{view.where('images')}: is empty. Name at least one image.")
-    return View(images, read_intensity(view), read_known_pose(view), read_field(view, folder))
+    return view_of(images, view, folder)
+
+
+def view_of(images: dict[str, Path], view: Fields, folder: Path) -> View:
+    """A view with these images, and what `VIEW_KEYS` say of it."""
+    return View(
+        images,
+        read_intensity(view),
+        read_known_pose(view),
+        read_field(view, folder),
+        read_frames(view),
+        read_display(view) if "display" in view else None,
+        read_grid(view, folder),
+    )
+
+
+def read_grid(view: Fields, folder: Path) -> GridImage | None:
+    """The image of a grid on an image intensifier, under `grid`: `{image, pitch_mm}`."""
+    if "grid" not in view:
+        return None
+    grid = view.mapping("grid").only("image", "pitch_mm")
+    pitch = grid.number("pitch_mm")
+    if pitch <= 0:
+        raise InputError(f"{grid.where('pitch_mm')}: a positive number of mm was expected, found {pitch:g}.")
+    return GridImage(grid.file_path("image", folder), pitch)
+
+
+def read_display(fields: Fields) -> Display:
+    """How images are stored, under `display`: `{source, mirrored, turned}`; what is left out is as usual."""
+    if "display" not in fields:
+        return Display()
+    display = fields.mapping("display").only("source", "mirrored", "turned")
+    source = cast(Source, display.choice("source", SOURCES)) if "source" in display else "anterior"
+    mirrored, turned = display.content.get("mirrored", False), display.content.get("turned", 0)
+    if not isinstance(mirrored, bool):
+        raise InputError(f"{display.where('mirrored')}: true or false was expected, found {mirrored!r}.")
+    if isinstance(turned, bool) or turned not in TURNS:
+        known = ", ".join(map(str, TURNS))
+        raise InputError(f"{display.where('turned')}: degrees clockwise, {known}, were expected, found {turned!r}.")
+    return Display(source, mirrored, turned)
+
+
+def read_frames(view: Fields) -> Frames | None:
+    """Which frames of cine runs are meant, under `frames`: a number from 1, several to be averaged, or `mean`."""
+    if "frames" not in view:
+        return None
+    value = view.value("frames", "a frame's number")
+    if value == "mean":
+        return "mean"
+    numbers = value if isinstance(value, list) else [value]
+    whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 1 for n in numbers)
+    if not numbers or not whole or len(set(numbers)) < len(numbers):
+        raise InputError(
+            f"{view.where('frames')}: a frame's number from 1, a list of such numbers, or `mean` was expected, found "
+            f"{value!r}."
+        )
+    return tuple(numbers)
 
 
 def read_field(view: Fields, folder: Path) -> Circle | Polygon | Path | None:
@@ -152,9 +226,9 @@ def read_field(view: Fields, folder: Path) -> Circle | Polygon | Path | None:
     return Polygon(tuple((column, row) for column, row in pairs))
 
 
-def read_intensity(view: Fields) -> Intensity:
-    """What the values of a view's images are."""
-    return cast(Intensity, view.choice("intensity", ("raw", "log")) if "intensity" in view else "raw")
+def read_intensity(view: Fields) -> Intensity | None:
+    """What the values of a view's images are; None where the case does not say."""
+    return cast(Intensity, view.choice("intensity", ("raw", "log"))) if "intensity" in view else None
 
 
 def read_known_pose(view: Fields) -> Tensor | None:

@@ -9,12 +9,19 @@ from femoreg_torch.case.femoroplasty import TEMPLATE
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.model import Case
 from femoreg_torch.case.objects import read_object, read_plan
-from femoreg_torch.case.parts import read_anatomy_and_bones, read_carm, read_truth, read_view, with_known_poses
+from femoreg_torch.case.parts import (
+    read_anatomy_and_bones,
+    read_carm,
+    read_display,
+    read_truth,
+    read_view,
+    with_known_poses,
+)
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume import read_landmarks
 
 VERSIONS = (1, 2)
-_KEYS = ("version", "anatomy", "ct", "landmarks", "objects", "plan", "carm", "views", "truth")
+_KEYS = ("version", "anatomy", "ct", "landmarks", "objects", "plan", "carm", "display", "views", "truth")
 
 
 def read_fields(folder: Path) -> Fields:
@@ -70,9 +77,10 @@ def _read_objects(top: Fields, folder: Path) -> Case:
             others = ", ".join(other for other in objects if other != name)
             raise InputError(f"{entries.where(name)}.start.beside: the name of another object was expected: {others}.")
     views = tuple(read_view(view, folder) for view in top.mappings("views")) if "views" in top else ()
+    display = read_display(top)
     return Case(
         folder=folder,
-        carm=read_carm(top),
+        carm=read_carm(top, display, views),
         objects=objects,
         views=with_known_poses(views, top),
         anatomy=anatomy,
@@ -82,6 +90,7 @@ def _read_objects(top: Fields, folder: Path) -> Case:
         landmarks=landmarks,
         plan=read_plan(top.mapping("plan"), folder, objects, landmarks) if "plan" in top else None,
         truth=read_truth(top, folder, list(objects), len(views)),
+        display=display,
     )
 
 

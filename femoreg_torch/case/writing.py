@@ -1,7 +1,7 @@
 """A `Case` into its folder: `case.yaml`, `landmarks.json` and `truth.json`."""
 
 import os
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from femoreg_torch.case.poses import poses_content
 from femoreg_torch.case.reading import VERSIONS
 from femoreg_torch.configs import preset_names
 from femoreg_torch.files import plain, write_json, write_text
-from femoreg_torch.fluoro import Circle, Polygon
+from femoreg_torch.fluoro import Circle, Display, Polygon
 from femoreg_torch.geometry import CArm, load_carm
 from femoreg_torch.volume import write_landmarks
 
@@ -45,7 +45,8 @@ def write_case(folder: Path, case: Case, standing: Path | None = None) -> None:
         content["objects"] = {name: _object(thing, base) for name, thing in case.objects.items()}
         if case.plan is not None:
             content["plan"] = _plan(case.plan, base)
-    content["carm"] = _carm(case.carm)
+    content["carm"] = _carm(replace(case.carm, camera=case.display.stored_camera(case.carm.camera)))
+    content |= _display(case.display)
     if case.views:
         content["views"] = [_view(view, base, case.template is not None) for view in case.views]
     if case.truth is not None:
@@ -158,7 +159,20 @@ def _view(view: View, folder: Path, short: bool) -> dict[str, Any]:
     images = {kind: _relative(path, folder) for kind, path in view.images.items()}
     content: dict[str, Any] = images if short or list(images) == [ONE_KIND] else {"images": images}
     pose = {} if view.camera_from_camera1 is None else {"camera_from_camera1": view.camera_from_camera1}
-    return content | {"intensity": view.intensity} | pose | _field(view, folder)
+    said = {} if view.intensity is None else {"intensity": view.intensity}
+    frames: Any = {} if view.frames is None else {"frames": view.frames}
+    if isinstance(view.frames, tuple) and len(view.frames) == 1:
+        frames = {"frames": view.frames[0]}
+    display = {} if view.display is None else _display(view.display, whole=True)
+    grid = {} if view.grid is None else {"image": _relative(view.grid.path, folder), "pitch_mm": view.grid.pitch_mm}
+    return content | said | pose | _field(view, folder) | frames | display | ({"grid": grid} if grid else {})
+
+
+def _display(display: Display, whole: bool = False) -> dict[str, Any]:
+    """Nothing for the usual display, unless the `whole` is asked for."""
+    if display == Display() and not whole:
+        return {}
+    return {"display": {"source": display.source, "mirrored": display.mirrored, "turned": display.turned_deg}}
 
 
 def _field(view: View, folder: Path) -> dict[str, Any]:

@@ -9,7 +9,10 @@ def detect(
     *,
     out: Path,
     carm: str = "cios_fusion",
-    intensity: Literal["raw", "log"] = "raw",
+    intensity: Literal["raw", "log"] | None = None,
+    mirrored: bool = False,
+    turned: Literal[0, 90, 180, 270] = 0,
+    frame: int | None = None,
     weights: Path | None = None,
     device: Literal["cpu", "cuda", "auto"] = "cpu",
 ) -> None:
@@ -24,18 +27,28 @@ def detect(
         images: fluoroscopic images, or folders of nothing else: DICOM, PNG, TIFF, NIfTI, MHA or NRRD.
         out: folder of the results.
         carm: C-arm that the images come from: a preset, or a YAML file such as configs/carm/cios_fusion.yaml.
-        intensity: raw (bone dark) or log (attenuation, bone bright).
+        intensity: raw (bone dark) or log (attenuation, bone bright); by default what the files say, or else raw.
+        mirrored: whether the images are mirror images of usual ones, which have the patient's left on the right.
+        turned: by how many degrees the images are turned clockwise against head up.
+        frame: of cine runs in DICOM files, from 1.
         weights: network weights (safetensors); by default the shipped ones.
         device: where the network computes: cpu, cuda (the first GPU), or auto, a GPU where there is one.
     """
     from rich.console import Console
 
     from femoreg_torch.commands.telling import tell_device
+    from femoreg_torch.detect import as_stored, filled, load_network, within_field
     from femoreg_torch.detect import detect as find
-    from femoreg_torch.detect import filled, load_network, within_field
     from femoreg_torch.detect.writing import write_detections
     from femoreg_torch.errors import InputError
-    from femoreg_torch.fluoro import attenuation_image, check_matches, exposed_field, read_image
+    from femoreg_torch.fluoro import (
+        Display,
+        attenuation_image,
+        check_matches,
+        exposed_field,
+        read_stored,
+        settled_intensity,
+    )
     from femoreg_torch.geometry import load_carm
     from femoreg_torch.pnp import MINIMUM
 
@@ -43,21 +56,24 @@ def detect(
     repeated = {path.stem for path in images if sum(path.stem == other.stem for other in images) > 1}
     if repeated:
         raise InputError(f"images: the name {min(repeated)} stands there twice. Rename one, results go by this name.")
-    camera = load_carm(carm).camera
+    display, as_shown = Display(mirrored=mirrored, turned_deg=turned), load_carm(carm).camera
+    camera = display.camera(as_shown)
     console = Console()
     network = load_network(weights, tell_device(console, device))
-    stored = [read_image(path) for path in images]
+    stored = [read_stored(path, None if frame is None else (frame,)) for path in images]
     for path, image in zip(images, stored, strict=True):
-        check_matches(image, camera, f"{path}:")
+        check_matches(image.values, as_shown, f"{path}:")
     attenuation, detections = [], []
-    for image in stored:
-        field = exposed_field(image if intensity == "raw" else (-image).exp(), camera)
-        shown = attenuation_image(image, field) if intensity == "raw" else image
+    for path, image in zip(images, stored, strict=True):
+        upright = display.to_camera(image.values)
+        raw = settled_intensity(intensity, image, str(path)) == "raw"
+        field = exposed_field(upright if raw else (-upright).exp(), camera)
+        shown = attenuation_image(upright, field) if raw else upright
         shown = shown if field is None else filled(shown, field)
         found = find(network, shown, camera)
-        attenuation.append(shown)
-        detections.append(found if field is None else within_field(found, field))
-    write_detections(out, images, attenuation, detections, camera)
+        attenuation.append(display.to_stored(shown))
+        detections.append(as_stored(found if field is None else within_field(found, field), display, camera))
+    write_detections(out, images, attenuation, detections, as_shown)
     for path, detection in zip(images, detections, strict=True):
         count = int(detection.visible.sum())
         remarks = [

@@ -1,4 +1,4 @@
-"""Images behind shutters: what the network is shown of them, and which landmarks are believed."""
+"""Images behind shutters, or stored in other ways: what the network is shown of them, and what is believed."""
 
 from dataclasses import replace
 
@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.detect.network import Detection
+from femoreg_torch.fluoro import Display
+from femoreg_torch.geometry import Camera
 
 
 def filled(attenuation: Tensor, field: Tensor) -> Tensor:
@@ -15,6 +17,16 @@ def filled(attenuation: Tensor, field: Tensor) -> Tensor:
     mean along the edge of the field, it took one of nine shuttered images for one with bone and background exchanged.
     """
     return attenuation.where(field, attenuation[field].min())
+
+
+def as_stored(detection: Detection, display: Display, camera: Camera) -> Detection:
+    """What was found in an image of `camera`, as places in the picture that is stored as `display` says."""
+    return replace(
+        detection,
+        pixels=display.pixels_to_stored(detection.pixels, camera),
+        segmentation=display.to_stored(detection.segmentation),
+        network_camera=display.stored_camera(detection.network_camera),
+    )
 
 
 def within_field(detection: Detection, field: Tensor) -> Detection:

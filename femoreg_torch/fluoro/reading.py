@@ -1,6 +1,8 @@
 """Reading and writing of fluoroscopic images."""
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -10,19 +12,47 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
+from femoreg_torch.fluoro.dicom import DicomImage, Frames, read_dicom
+from femoreg_torch.fluoro.tags import Tags
 from femoreg_torch.geometry import Camera
 from femoreg_torch.volume.itk import read_itk
 
 _ITK_SUFFIXES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
+_SCREEN_SUFFIXES = (".jpg", ".jpeg", ".bmp")  # what nobody stores intensities in
+_LOG_RANGE = (2.0, 20.0)  # of the greatest attenuation in an image: 45 cm of water at 60 keV are 9
+_GREY_STEPS = 12  # by which the colours of a grey JPEG may differ
+_SCREEN = (
+    "is a picture of a screen: 8 bits, with a window and a curve that nobody knows. Take the DICOM file where there "
+    "is one"
+)
 
 
-def _read_picture(path: Path) -> np.ndarray:
+@dataclass(frozen=True, eq=False)
+class StoredImage:
+    """An image as it is stored, and what its file says of it."""
+
+    values: Tensor  # (H, W) float32
+    intensity: Literal["raw", "log"] | None = None  # what the file says the values are
+    tags: Tags | None = None  # of a DICOM file
+    padding: Tensor | None = None  # (H, W) bool: pixels that hold no image
+    remarks: tuple[str, ...] = ()  # for the user, after the name of the file
+    asks: str | None = None  # why the case has to say what the values are
+
+
+def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     content = np.frombuffer(path.read_bytes(), np.uint8)
     image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
     if image is None:
-        raise InputError(f"{path}: cannot be read as a PNG or TIFF image; the file is damaged or something else.")
-    return image
+        raise InputError(
+            f"{path}: cannot be read as a PNG or TIFF or JPEG image; the file is damaged or something else."
+        )
+    screen = path.suffix.lower() in _SCREEN_SUFFIXES or (path.suffix.lower() == ".png" and image.dtype == np.uint8)
+    if image.ndim == 3 and image.shape[-1] in (3, 4):
+        colours = image[..., :3].astype(np.int64)
+        if np.ptp(colours, axis=-1).max() <= (_GREY_STEPS if path.suffix.lower() in _SCREEN_SUFFIXES else 0):
+            image, screen = image[..., 1], True
+    return image, (_SCREEN,) if screen else ()
 
 
 def _read_itk(path: Path) -> np.ndarray:
@@ -30,47 +60,30 @@ def _read_itk(path: Path) -> np.ndarray:
     return array[0] if array.ndim == 3 and array.shape[0] == 1 else array
 
 
-def _read_dicom(path: Path) -> np.ndarray:
-    import pydicom  # a fifth of a second, and most images are of other kinds
-    from pydicom.errors import InvalidDicomError
-    from pydicom.pixels import apply_rescale
+def read_stored(path: Path, frames: Frames | None = None) -> StoredImage:
+    """A fluoroscopic image and what its file says of it.
 
-    try:
-        dataset = pydicom.dcmread(path)
-    except InvalidDicomError as error:
-        raise InputError(
-            f"{path}: not a DICOM file, and its name does not end in {', '.join(_PICTURE_SUFFIXES + _ITK_SUFFIXES)}."
-        ) from error
-    frames = int(dataset.get("NumberOfFrames") or 1)
-    if frames > 1:
-        raise InputError(f"{path}: holds {frames} frames, one was expected. Export the frame to be registered.")
-    try:
-        pixels = dataset.pixel_array
-    except (AttributeError, KeyError, NotImplementedError, RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: the DICOM file holds no image that can be decoded ({error}).") from error
-    if dataset.PhotometricInterpretation == "MONOCHROME1":  # low values are shown bright
-        lowest = -(2 ** (dataset.BitsStored - 1)) if dataset.PixelRepresentation else 0
-        pixels = 2 * lowest + 2**dataset.BitsStored - 1 - pixels.astype(np.int64)
-    return apply_rescale(pixels, dataset)
-
-
-def read_image(path: Path) -> Tensor:
-    """A fluoroscopic image (H, W), float32, with the values as stored.
-
-    PNG and TIFF of 8 or 16 bits, NIfTI, MHA or NRRD of one slice, and anything else as a single DICOM frame (rescale
-    applied, MONOCHROME1 inverted so that dark stays dark). Raises `InputError` for a missing or unreadable file, a
-    colour or multi-frame image, values that are not finite, and an image of constant value.
+    PNG, TIFF and JPEG, NIfTI, MHA or NRRD of one slice, and anything else as DICOM. Values are as stored; those of
+    DICOM files after rescaling, with dark bone where the header says or implies that they are intensities, and as
+    attenuation (bone bright) where it says that they are logarithms. `frames` of a cine run are averaged. Raises
+    `InputError` for a missing or unreadable file, a colour image, a run without `frames`, values that are not finite,
+    and an image of constant value.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file.")
     name = path.name.lower()
-    if name.endswith(_PICTURE_SUFFIXES):
-        array = _read_picture(path)
+    dicom: DicomImage | None = None
+    remarks: tuple[str, ...] = ()
+    if name.endswith(_PICTURE_SUFFIXES + _SCREEN_SUFFIXES):
+        array, remarks = _read_picture(path)
     elif name.endswith(_ITK_SUFFIXES):
         array = _read_itk(path)
     else:
-        array = _read_dicom(path)
+        dicom = read_dicom(path, frames)
+        array, remarks = dicom.values, dicom.remarks
+    if frames is not None and dicom is None:
+        raise InputError(f"{path}: `frames` are for DICOM files. Leave them out.")
     if array.ndim == 3 and array.shape[-1] in (3, 4):
         raise InputError(f"{path}: a colour image, but fluoroscopy has one value per pixel. Export it as greyscale.")
     if array.ndim != 2:
@@ -81,7 +94,35 @@ def read_image(path: Path) -> Tensor:
         raise InputError(f"{path}: holds pixels that are not finite (NaN or infinite). Export the image anew.")
     if lowest == highest:
         raise InputError(f"{path}: every pixel is {lowest:g}, there is nothing to be seen. Choose another image.")
-    return image
+    if dicom is None:
+        looks_log = lowest > -1 and _LOG_RANGE[0] < highest < _LOG_RANGE[1] and bool((image != image.round()).any())
+        return StoredImage(image, remarks=remarks, asks="looks like logarithms already" if looks_log else None)
+    padding = None if dicom.padding is None else torch.from_numpy(dicom.padding)
+    return StoredImage(image, dicom.intensity, dicom.tags, padding, remarks, dicom.asks)
+
+
+def read_image(path: Path, frames: Frames | None = None) -> Tensor:
+    """The values (H, W), float32, of a fluoroscopic image; see `read_stored`."""
+    return read_stored(path, frames).values
+
+
+def settled_intensity(said: Literal["raw", "log"] | None, image: StoredImage, where: str) -> Literal["raw", "log"]:
+    """What the values of an image are, by its file and by what a case says.
+
+    Raises `InputError` that starts with `where` if the two contradict each other, or if neither says it and it cannot
+    be taken for granted.
+    """
+    if said is not None and image.intensity is not None and said != image.intensity:
+        words = {"raw": "intensities (raw)", "log": "logarithms (log)"}
+        raise InputError(
+            f"{where} holds {words[image.intensity]} by its PixelIntensityRelationship, but the case says "
+            f"`intensity: {said}`. Correct it, or leave it out."
+        )
+    if said is None and image.intensity is None and image.asks is not None:
+        raise InputError(
+            f"{where} {image.asks}. Say so in the view: `intensity: raw` (bone dark) or `log` (bone bright)."
+        )
+    return said or image.intensity or "raw"
 
 
 def write_image(path: Path, image: Tensor) -> None:

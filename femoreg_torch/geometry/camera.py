@@ -83,6 +83,24 @@ class Camera:
             principal_point_px=((self.principal_point_px[0] - c0) / dc, (self.principal_point_px[1] - r0) / dr),
         )
 
+    def mirrored(self) -> "Camera":
+        """The camera of the image with its columns in reverse order."""
+        column, row = self.principal_point_px
+        return replace(self, principal_point_px=(self.shape[1] - 1 - column, row))
+
+    def turned(self, quarters: int) -> "Camera":
+        """The camera of the image turned counter-clockwise by so many quarter turns, as `torch.rot90` turns it."""
+        camera = self
+        for _ in range(quarters % 4):
+            (column, row), (rows, columns) = camera.principal_point_px, camera.shape
+            camera = replace(
+                camera,
+                pixel_mm=(camera.pixel_mm[1], camera.pixel_mm[0]),
+                shape=(columns, rows),
+                principal_point_px=(row, columns - 1 - column),
+            )
+        return camera
+
     def matrix(self, dtype: torch.dtype = torch.float64) -> Tensor:
         """K (3, 3): pixel (column, row, 1) ∝ K @ point_camera."""
         fx, fy = self.sdd_mm / self.pixel_mm[1], self.sdd_mm / self.pixel_mm[0]

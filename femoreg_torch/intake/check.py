@@ -1,5 +1,6 @@
 """Everything that is wrong with a case, at once, and a picture of how it was understood: `femoreg check`."""
 
+import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,12 +25,22 @@ from femoreg_torch.case.femoroplasty import (
     planned,
 )
 from femoreg_torch.case.fields import Fields
-from femoreg_torch.case.model import PlannedPath, Side
+from femoreg_torch.case.model import PlannedPath, Side, View
 from femoreg_torch.case.models import MODEL_KEYS, read_model
-from femoreg_torch.case.parts import read_bones, read_carm, read_field, read_intensity, read_known_pose
+from femoreg_torch.case.parts import (
+    VIEW_KEYS,
+    read_bones,
+    read_carm,
+    read_display,
+    read_field,
+    read_frames,
+    read_grid,
+    read_intensity,
+    read_known_pose,
+)
 from femoreg_torch.case.reading import read_fields
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import check_matches, read_image
+from femoreg_torch.fluoro import Display, check_matches, read_image
 from femoreg_torch.geometry import CArm
 from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.start_picture import picture_of_start
@@ -135,7 +146,9 @@ def _check_femoroplasty(top: Fields, folder: Path, found: _Found) -> _Anatomy:
     found.unknown_keys(top, ("template", *femoroplasty_form.KEYS))
     side = cast("Side | None", found.attempt(lambda: top.choice("side", femoroplasty_form.SIDES)))
     marks = found.attempt(lambda: read_landmarks(top.file_path("landmarks", folder))) or {}
-    carm = found.attempt(lambda: read_carm(top))
+    display = found.attempt(lambda: read_display(top)) or Display()
+    views = _readable_views(top, folder)
+    carm = found.attempt(lambda: read_carm(top, display, views))
     ct = found.attempt(lambda: top.mapping("ct"))
     seen = _Anatomy(landmarks=marks, anatomy=HIP)
     if ct is not None:
@@ -160,7 +173,7 @@ def _check_femoroplasty(top: Fields, folder: Path, found: _Found) -> _Anatomy:
             _check_path(path, side, seen, found)
     if DEVICE in top:
         _check_device(top, folder, path, side, found)
-    _check_views(top, folder, carm, found)
+    _check_views(top, folder, carm, display, found)
     if "truth" in top:
         found.attempt(lambda: top.file_path("truth", folder))
     return seen
@@ -294,7 +307,22 @@ def _device_points(device: Fields, folder: Path, found: _Found) -> dict[str, Ten
     return found.attempt(lambda: femoroplasty_form.read_device_points(device, folder)) or {}
 
 
-def _check_views(top: Fields, folder: Path, carm: CArm | None, found: _Found) -> None:
+def _readable_views(top: Fields, folder: Path) -> list[View]:
+    """The views in which nothing is wrong; what is wrong with the others is told by `_check_views`."""
+    read: list[View] = []
+    try:
+        views = top.mappings("views")
+    except InputError:
+        return read
+    for view in views:
+        try:
+            read.append(femoroplasty_form.read_view(view, folder))
+        except InputError:
+            continue
+    return read
+
+
+def _check_views(top: Fields, folder: Path, carm: CArm | None, display: Display, found: _Found) -> None:
     views = found.attempt(lambda: top.mappings("views"))
     if views is None:
         return
@@ -303,8 +331,12 @@ def _check_views(top: Fields, folder: Path, carm: CArm | None, found: _Found) ->
     read: dict[str, Tensor] = {}
     kinds = (ANATOMY_IMAGES, DEVICE_IMAGES)
     for view in views:
-        found.unknown_keys(view, femoroplasty_form.VIEW_KEYS)
-        for get in (read_intensity, read_known_pose, lambda one: read_field(one, folder)):
+        found.unknown_keys(view, (ANATOMY_IMAGES, DEVICE_IMAGES, *VIEW_KEYS))
+        shown = display
+        if "display" in view:
+            shown = found.attempt(lambda view=view: read_display(view)) or display  # type: ignore[misc]
+        by_folder = (lambda one: read_field(one, folder), lambda one: read_grid(one, folder))
+        for get in (read_intensity, read_known_pose, read_frames, *by_folder):
             found.attempt(lambda get=get, view=view: cast(Callable[[Fields], Any], get)(view))  # type: ignore[misc]
         for kind in kinds:
             if kind == DEVICE_IMAGES and kind not in view:
@@ -316,7 +348,8 @@ def _check_views(top: Fields, folder: Path, carm: CArm | None, found: _Found) ->
             where = view.where(kind)
             read[where] = image
             if carm is not None:
-                found.attempt(lambda image=image, where=where: check_matches(image, carm.camera, f"{where}: it"))  # type: ignore[misc]
+                camera = shown.stored_camera(carm.camera)
+                found.attempt(functools.partial(check_matches, image, camera, f"{where}: it"))
     _check_different(read, found)
     if DEVICE in top and views and not any(DEVICE_IMAGES in view for view in views):
         found.warnings.append("no view has an image with the device, so it will not be found")
@@ -356,12 +389,13 @@ def _check_written_out(case: Case, found: _Found) -> _Anatomy:
 def _check_images(case: Case, found: _Found) -> None:
     read: dict[str, Tensor] = {}
     for number, view in enumerate(case.views):
+        camera = case.display_of(number).stored_camera(case.carm.camera)
         for kind, path in view.images.items():
             image = found.attempt(lambda path=path: read_image(path))  # type: ignore[misc]
             if image is not None:
                 where = f"{case.folder}/case.yaml, views[{number}].{kind}"
                 read[where] = image
-                found.attempt(lambda image=image, where=where: check_matches(image, case.carm.camera, f"{where}: it"))  # type: ignore[misc]
+                found.attempt(functools.partial(check_matches, image, camera, f"{where}: it"))
     _check_different(read, found)
 
 

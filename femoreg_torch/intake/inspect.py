@@ -230,7 +230,7 @@ def _image(path: Path) -> Findings:
         warnings.append(
             "at most 256 grey values: a picture made for a screen, whose logarithm may not be a line integral"
         )
-    grey = ((image - low) / (high - low) * 255).numpy().astype(np.uint8)
+    grey = ((image - low) / max(high - low, 1e-9) * 255).numpy().astype(np.uint8)
     shrink = min(1.0, 768 / max(grey.shape))
     picture = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     return Findings("image", facts, tuple(warnings), np.repeat(picture[..., None], 3, 2))

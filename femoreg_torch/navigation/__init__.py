@@ -3,7 +3,7 @@
 from femoreg_torch.navigation.guidance import Guidance, guide
 from femoreg_torch.navigation.report import NAVIGATION_NAME, navigation_content, summary
 from femoreg_torch.navigation.robot import Robot, read_robot
-from femoreg_torch.navigation.writing import NAVIGATION_NAMES, write_navigation
+from femoreg_torch.navigation.writing import NAVIGATION_NAMES, transform_text, write_navigation
 
 __all__ = [
     "NAVIGATION_NAME",
@@ -14,5 +14,6 @@ __all__ = [
     "navigation_content",
     "read_robot",
     "summary",
+    "transform_text",
     "write_navigation",
 ]

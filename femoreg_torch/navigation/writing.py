@@ -39,7 +39,7 @@ def write_navigation(folder: Path, content: dict[str, Any]) -> None:
             notes = [f"{name}: {meaning}", *(f"NOT TRUSTED: {reason}" for reason in content["reasons"]), NOTICE]
             notes = [" ".join(note.split()) for note in notes]
             write_text(folder / FOLDER_NAME / f"{name}.txt", _text(content[name], notes))
-            write_text(folder / FOLDER_NAME / f"{name}.tfm", _tfm(content[name], notes))
+            write_text(folder / FOLDER_NAME / f"{name}.tfm", transform_text(content[name], notes))
 
 
 def _text(b_from_a: Tensor, notes: list[str]) -> str:
@@ -47,7 +47,7 @@ def _text(b_from_a: Tensor, notes: list[str]) -> str:
     return "\n".join([*(f"# {note}" for note in notes), *rows]) + "\n"
 
 
-def _tfm(b_from_a: Tensor, notes: list[str]) -> str:
+def transform_text(b_from_a: Tensor, notes: list[str]) -> str:
     """An ITK transform file in ITK's direction, which resampling needs: it takes points of b to a.
 
     3D Slicer reads a `.tfm` so, and turns it about: a model in frame a that is put under it appears in frame b.

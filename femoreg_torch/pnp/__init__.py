@@ -1,6 +1,6 @@
 """Robust pose of an object from its landmarks in one image, and exact ones from three points."""
 
 from femoreg_torch.pnp.minimal import refined_pose, three_point_poses
-from femoreg_torch.pnp.solve import MINIMUM, PnpResult, solve_pnp
+from femoreg_torch.pnp.solve import FRONT_TO_BACK, MINIMUM, PnpResult, solve_pnp
 
-__all__ = ["MINIMUM", "PnpResult", "refined_pose", "solve_pnp", "three_point_poses"]
+__all__ = ["FRONT_TO_BACK", "MINIMUM", "PnpResult", "refined_pose", "solve_pnp", "three_point_poses"]

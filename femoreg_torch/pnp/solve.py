@@ -34,7 +34,8 @@ _HUBER_DEVIATIONS = 1.5
 _ROTATION_DEG = 10.0  # greatest standard deviation, over all axes, of a pose that is given
 _STEPS = (0.01, 0.01, 0.01, 1, 1, 10)  # typical sizes of a twist, rad and mm
 _ADVICE = "Take a view that shows more of the object, or give landmarks placed by hand."
-_TILT_DEG = 30.0  # prior standard deviation of the beam about the patient's front-to-back axis, each way
+_TILT_DEG = 30.0  # prior standard deviation of the beam about the axis of the patient that it runs along, each way
+FRONT_TO_BACK = (0.0, 1.0, 0.0)  # a beam in LPS whose source stands in front of the patient
 
 
 @dataclass(frozen=True)
@@ -59,16 +60,17 @@ def solve_pnp(
     weights: Tensor | None = None,
     deviations_px: Tensor | None = None,
     point_deviations_mm: Tensor | None = None,
+    beam: tuple[float, float, float] = FRONT_TO_BACK,
 ) -> PnpResult:
     """Pose of `points` (N, 3) in LPS mm that were seen at `pixels` (N, 2) (column, row) of `camera`.
 
     `weights` (N,) are positive, for instance the confidences. `deviations_px` (N,) are standard deviations of the
     landmarks along each axis in the image, `point_deviations_mm` (N,) those of the points themselves (0 if not given),
     which the image shows magnified; with the former the pose is the maximum a posteriori, with the prior that the beam
-    runs from front to back within about 30°, and the covariance is that of the posterior. Only poses are considered
-    that have the points between source and detector and the beam entering from the patient's front, which is the case
-    wherever the image is shown with patient left on the right and head up (or turned by 180°). The result does not
-    depend on chance.
+    runs along `beam`, an axis of LPS from source to detector, within about 30°, and the covariance is that of the
+    posterior. Only poses are considered that have the points between source and detector and the beam entering from
+    that side. The image must be as the source sees it: no pose fits a mirrored one. The result does not depend on
+    chance.
 
     Raises `InputError` "too few usable landmarks …" when fewer than four, or fewer than half of the points, agree, or
     if by `deviations_px` the rotation is uncertain by more than 10°.
@@ -80,7 +82,8 @@ def solve_pnp(
     pixel_mm = float(np.mean(camera.pixel_mm))
     limit_px = _INLIER_MM / pixel_mm
 
-    pose = _consensus(object_points, image_points, scale, camera, limit_px)
+    along = np.asarray(beam, dtype=np.float64)
+    pose = _consensus(object_points, image_points, scale, camera, limit_px, along)
     inliers = np.zeros(len(scale), dtype=bool) if pose is None else _distances(pose, points, pixels, camera) < limit_px
     for _ in range(3):
         if pose is None or not _enough(inliers):
@@ -89,9 +92,9 @@ def solve_pnp(
         inliers = _distances(pose, points, pixels, camera) < limit_px
     if pose is not None and _enough(inliers) and deviations_px is not None:
         spread = _spread_px(pose.numpy(), object_points, deviations_px, point_deviations_mm, camera)
-        pose, covariance = _most_probable(pose, object_points, image_points, spread, camera)
+        pose, covariance = _most_probable(pose, object_points, image_points, spread, camera, along)
         inliers = _distances(pose, points, pixels, camera) < limit_px
-    if pose is None or not _enough(inliers) or not _plausible(pose.numpy(), object_points, camera):
+    if pose is None or not _enough(inliers) or not _plausible(pose.numpy(), object_points, camera, along):
         raise InputError(
             f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree on a pose, but at least {MINIMUM} "
             f"and half of them must. {_ADVICE}"
@@ -146,16 +149,18 @@ def _subsets(count: int) -> list[tuple[int, ...]]:
     return [tuple(rng.choice(count, sizes[n % len(sizes)], replace=False)) for n in range(_HYPOTHESES)]
 
 
-def _plausible(camera_from_object: Array, points: Array, camera: Camera) -> bool:
-    """Whether all points lie between source and detector and the beam enters from the patient's front (+y is back)."""
+def _plausible(camera_from_object: Array, points: Array, camera: Camera, beam: Array) -> bool:
+    """Whether all points lie between source and detector and the beam runs the way of `beam` (3,) rather than back."""
     depth = points @ camera_from_object[2, :3] + camera_from_object[2, 3]
     low, high = (share * camera.sdd_mm for share in _DEPTHS)
     nearest, furthest = (share * camera.sdd_mm for share in _MIDDLE_DEPTHS)
     between = depth.min() > low and depth.max() < high and nearest < depth.mean() < furthest
-    return bool(between and camera_from_object[2, 1] > 0)
+    return bool(between and camera_from_object[2, :3] @ beam > 0)
 
 
-def _consensus(points: Array, pixels: Array, weights: Array, camera: Camera, limit_px: float) -> Tensor | None:
+def _consensus(
+    points: Array, pixels: Array, weights: Array, camera: Camera, limit_px: float, beam: Array
+) -> Tensor | None:
     """The hypothesis of least truncated squared residuals (MSAC), or None if no subset has a plausible pose."""
     matrix = camera.matrix().numpy()
     best, best_cost = None, np.inf
@@ -171,7 +176,7 @@ def _consensus(points: Array, pixels: Array, weights: Array, camera: Camera, lim
             pose = np.eye(4)
             pose[:3, :3] = cv2.Rodrigues(rotations[n])[0]
             pose[:3, 3] = translations[n].ravel()
-            if not _plausible(pose, points, camera):
+            if not _plausible(pose, points, camera, beam):
                 continue
             projected = points @ pose[:3, :3].T + pose[:3, 3]
             projected = projected @ matrix.T
@@ -237,12 +242,12 @@ def _refine(
 
 
 def _most_probable(
-    camera_from_object: Tensor, points: Array, pixels: Array, deviations_px: Array, camera: Camera
+    camera_from_object: Tensor, points: Array, pixels: Array, deviations_px: Array, camera: Camera, beam: Array
 ) -> tuple[Tensor, Tensor]:
     """The maximum a posteriori pose near `camera_from_object`, and its covariance (6, 6) about the points' centroid.
 
     Residuals are in standard deviations; beyond 1.5 of them they count by Huber's rule. The beam's direction in the
-    patient is the third row of the rotation; its parts across the front-to-back axis are the prior's residuals.
+    patient is the third row of the rotation; its parts across the axis `beam` are the prior's residuals.
     """
     start = camera_from_object.numpy()
     movable = _movable(start, points, camera)
@@ -252,8 +257,9 @@ def _most_probable(
         offset = (movable.pixels(twist) - pixels) / deviations_px[:, None]
         length = np.linalg.norm(offset, axis=1, keepdims=True).clip(1e-12)
         linear = np.sqrt(np.maximum(2 * _HUBER_DEVIATIONS * length - _HUBER_DEVIATIONS**2, 0)) / length
-        beam = (cv2.Rodrigues(twist[:3])[0] @ start[:3, :3])[2]
-        return np.append((np.where(length < _HUBER_DEVIATIONS, 1, linear) * offset).ravel(), beam[[0, 2]] / tilt)
+        direction = (cv2.Rodrigues(twist[:3])[0] @ start[:3, :3])[2]
+        across = direction[beam == 0] / tilt
+        return np.append((np.where(length < _HUBER_DEVIATIONS, 1, linear) * offset).ravel(), across)
 
     solution = least_squares(residuals, np.zeros(6), x_scale=_STEPS)
     return movable.pose(solution.x, start), torch.from_numpy(np.linalg.pinv(solution.jac.T @ solution.jac))

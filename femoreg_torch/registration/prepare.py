@@ -14,11 +14,18 @@ from femoreg_torch.case import Case, CaseObject
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import (
     Circle,
+    Distortion,
     Polygon,
+    StoredImage,
     attenuation_image,
     check_matches,
+    contradictions,
+    find_distortion,
     find_shutter,
     read_image,
+    read_stored,
+    settled_intensity,
+    side_remarks,
     without_penumbra,
 )
 from femoreg_torch.registration.models import model_attenuation
@@ -91,6 +98,7 @@ def prepare_scene(case: Case) -> Scene:
         tissue=tissue,
         outline=outline,
         camera_from_camera1=torch.stack(cameras) if known else None,
+        left_on_left=tuple(view for view in range(len(case.views)) if case.display_of(view).left_on_left),
         missing=told,
     )
 
@@ -162,7 +170,7 @@ def read_images(case: Case) -> tuple[ByKind, ByKind, tuple[str, ...]]:
             read = [_read_image(case, i, kind) if kind in view.images else None for i, view in enumerate(case.views)]
             images[kind] = tuple(None if one is None else one.attenuation for one in read)
             fields[kind] = tuple(None if one is None else one.field for one in read)
-            told += [one.told for one in read if one is not None and one.told is not None]
+            told += [remark for one in read if one is not None for remark in one.told]
         if without:
             told.append(_told(case, kind, without))
     _check_different(case, images)
@@ -206,33 +214,94 @@ def _listed(words: Sequence[object]) -> str:
 class _Image:
     attenuation: Tensor  # (H, W)
     field: Tensor | None  # (H, W) bool: what is exposed; None: all
-    told: str | None  # of a shutter that was found, in words
+    told: tuple[str, ...]  # of a shutter that was found, and of the file, in words
 
 
 def _read_image(case: Case, index: int, kind: Kind) -> _Image:
-    """One image of a view (from 0) and its field: what the case tells, or else what a shutter leaves of it."""
-    view, camera = case.views[index], case.carm.camera
-    image = read_image(view.images[kind])
-    check_matches(image, camera, f"{case.folder}/case.yaml, views[{index}].{kind}")
-    raw = image if view.intensity == "raw" else (-image).exp()
-    field, told = None, None
-    if view.field is not None:
-        field = without_penumbra(_told_field(case, index, view.field), camera)
-        if not field.any():
-            raise InputError(f"{case.folder}/case.yaml, views[{index}].field: exposes no pixel of the image.")
-    elif (shutter := find_shutter(raw, camera)) is not None:
-        field = shutter.field
-        told = (
-            f"view {index + 1}, {kind} image: a {shutter.shape} shutter was found, "
-            f"{100 * shutter.exposed:.0f} % of the detector is exposed"
-        )
-    return _Image(attenuation_image(image, field) if view.intensity == "raw" else image, field, told)
+    """One image of a view (from 0) as the source sees it, and its field: see `_field`."""
+    view, display, camera = case.views[index], case.display_of(index), case.carm.camera
+    where, told = f"{case.folder}/case.yaml, views[{index}].{kind}", f"view {index + 1}, {kind} image: "
+    stored = read_stored(view.images[kind], view.frames)
+    as_stored = display.stored_camera(camera)
+    check_matches(stored.values, as_stored, where)
+    if stored.tags is not None and (wrong := contradictions(stored.tags, as_stored, display, case.carm.uncertainty)):
+        raise InputError(f"{where}: {view.images[kind].name}, {'; '.join(wrong)}.")
+    unsaid = [] if stored.tags is None else side_remarks(stored.tags, display)
+    logarithms = settled_intensity(view.intensity, stored, f"{where}: {view.images[kind].name}") == "log"
+    distortion = view_distortion(case, index)
+    straight = stored.values if distortion is None else distortion.straightened(stored.values)
+    image = display.to_camera(straight)
+    raw = (-image).exp() if logarithms else image
+    field, shutter = _field(case, index, stored, raw, distortion)
+    if field is not None and not field.any():
+        told_by = f"{case.folder}/case.yaml, views[{index}].field" if view.field is not None else f"{where}: its header"
+        raise InputError(f"{told_by}: exposes no pixel of the image.")
+    bent = [] if distortion is None else [_told_distortion(distortion)]
+    remarks = (
+        *bent,
+        *(f"{view.images[kind].name} {remark}" for remark in stored.remarks),
+        *(f"{view.images[kind].name}: {remark}" for remark in unsaid),
+        *([shutter] if shutter else []),
+    )
+    return _Image(
+        image if logarithms else attenuation_image(image, field), field, tuple(told + remark for remark in remarks)
+    )
+
+
+def view_distortion(case: Case, index: int) -> Distortion | None:
+    """What the grid image of a view (from 0) says of its image intensifier; None without one. Raises `InputError`."""
+    grid = case.views[index].grid
+    if grid is None:
+        return None
+    image, camera = read_image(grid.path), case.display_of(index).stored_camera(case.carm.camera)
+    where = f"{case.folder}/case.yaml, views[{index}].grid"
+    check_matches(image, camera, where)
+    return find_distortion(image, camera, grid.pitch_mm, where)
+
+
+def _told_distortion(found: Distortion) -> str:
+    return (
+        f"made straight by {found.spots} spots of its grid: moved by up to {found.greatest_mm:.1f} mm, "
+        f"{found.residual_mm:.2f} mm left (root mean square)"
+    )
+
+
+def _field(
+    case: Case, index: int, stored: StoredImage, raw: Tensor, distortion: Distortion | None
+) -> tuple[Tensor | None, str | None]:
+    """The exposed pixels (H, W) of an image `raw` of a view (from 0), None for all, and where they come from, in words.
+
+    The field is what the case tells, or else what the header's shutter leaves, or else what a shutter in the image
+    leaves; pixels that hold no image are never exposed.
+    """
+    camera, display, told = case.carm.camera, case.display_of(index), case.views[index].field
+    field, words = None, None
+
+    def seen(mask: Tensor) -> Tensor:
+        return display.to_camera(mask if distortion is None else distortion.straightened(mask))
+
+    if told is not None:
+        field = seen(_told_field(case, index, told))
+    elif stored.tags is not None and stored.tags.field is not None:
+        field = seen(stored.tags.field.exposed(display.stored_camera(camera).shape))
+        words = f"a shutter by its header, {100 * float(field.double().mean()):.0f} % of the detector is exposed"
+    if stored.padding is not None:
+        image = ~seen(stored.padding)
+        field = image if field is None else field & image
+    if field is not None:
+        return without_penumbra(field, camera), words
+    shutter = find_shutter(raw, camera)
+    if shutter is None:
+        return None, None
+    words = f"a {shutter.shape} shutter was found, {100 * shutter.exposed:.0f} % of the detector is exposed"
+    return shutter.field, words
 
 
 def _told_field(case: Case, index: int, field: Circle | Polygon | Path) -> Tensor:
-    """The exposed pixels (H, W) that a view (from 0) tells."""
+    """The exposed pixels (H, W), as the images are stored, that a view (from 0) tells."""
+    camera = case.display_of(index).stored_camera(case.carm.camera)
     if not isinstance(field, Path):
-        return field.exposed(case.carm.camera.shape)
+        return field.exposed(camera.shape)
     mask = read_image(field)
-    check_matches(mask, case.carm.camera, f"{case.folder}/case.yaml, views[{index}].field")
+    check_matches(mask, camera, f"{case.folder}/case.yaml, views[{index}].field")
     return mask > 0

@@ -8,10 +8,12 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, Anatomy
 from femoreg_torch.case import Case, LandmarkRecord, StartRecord
-from femoreg_torch.detect import Detection, filled, within_field
+from femoreg_torch.detect import Detection, as_stored, filled, within_field
 from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Camera, transform_points
-from femoreg_torch.pnp import MINIMUM, PnpResult, solve_pnp
+from femoreg_torch.pnp import FRONT_TO_BACK, MINIMUM, PnpResult, solve_pnp
+from femoreg_torch.registration.prepare import view_distortion
 from femoreg_torch.registration.scene import Outline, Scene, Segmentation
 from femoreg_torch.registration.silhouette import refine_by_silhouette
 
@@ -23,6 +25,7 @@ LEAST_OVERLAP = 0.90  # Dice of the outlined bones
 # Greatest standard deviation of the rotation, over all axes, of a start by landmarks alone. Outlines mend what is more
 # open (9° open: 2 to 3° off afterwards).
 MOST_ROTATION_DEG = 5.0
+_MIRRORED = Display(mirrored=True)
 GIVEN_DEVIATION_MM = 1.5  # on the detector, along each axis: of landmarks that a person picked in the image
 
 
@@ -44,14 +47,21 @@ def start_by_detection(case: Case, scene: Scene, detection: Detection) -> StartR
     image, field = scene.image(scene.first_kind, 0), scene.field(scene.first_kind, 0)
     anatomy = case.anatomy or HIP
     try:
-        start = find_start(case.landmarks, detection, image, case.carm.camera, scene.outline, anatomy, field)
+        start = find_start(
+            case.landmarks, detection, image, case.carm.camera, scene.outline, anatomy, field, case.display_of(0).beam
+        )
     except InputError as error:
         raise InputError(f"{case.views[0].images[scene.first_kind]}: {error}") from error
-    return _record(scene.anchor, detection, start, anatomy.landmark_names)
+    stored = case.display_of(0).pixels_to_stored(detection.pixels, case.carm.camera)
+    if (distortion := view_distortion(case, 0)) is not None:
+        stored = torch.from_numpy(distortion.bent(stored.numpy()))
+    return _record(scene.anchor, replace(detection, pixels=stored), start, anatomy.landmark_names)
 
 
 def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) -> StartRecord:
     """The pose (4, 4) of the object `anchor` from `pixels` (2,), column and row, of landmarks picked in view 1.
+
+    Pixels are those of the image as it is stored.
 
     Raises `InputError` if fewer than four have a name that the case knows, fewer than four agree, or they leave the
     rotation open by more than 5°.
@@ -62,7 +72,9 @@ def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) ->
             f"landmarks in the image: {len(names)} have the name of a landmark of the case "
             f"({', '.join(case.landmarks)}), at least {MINIMUM} are needed."
         )
-    camera = case.carm.camera
+    camera, display = case.carm.camera, case.display_of(0)
+    picked, distortion = torch.stack([pixels[name] for name in names]).double(), view_distortion(case, 0)
+    seen = display.pixels_to_camera(picked if distortion is None else distortion.straight(picked), camera)
     spread = (
         {}
         if case.anatomy is None
@@ -70,10 +82,11 @@ def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) ->
     )
     pnp = solve_pnp(
         torch.stack([case.landmarks[name] for name in names]).double(),
-        torch.stack([pixels[name] for name in names]).double(),
+        seen,
         camera,
         deviations_px=torch.full((len(names),), GIVEN_DEVIATION_MM / camera.mean_pixel_mm, dtype=torch.float64),
         point_deviations_mm=torch.tensor([spread.get(name, 0.0) for name in names], dtype=torch.float64),
+        beam=display.beam,
     )
     _check_rotation(pnp)
     marks = {
@@ -91,10 +104,12 @@ def find_start(
     outline: Outline | None,
     anatomy: Anatomy,
     field: Tensor | None = None,
+    beam: tuple[float, float, float] = FRONT_TO_BACK,
 ) -> Start:
     """The pose of a CT with `landmarks` (3,) in an image (H, W), by PnP and then by the outlines of its bones.
 
-    `field` (H, W), bool, is the exposed part of the image; None: all of it.
+    `field` (H, W), bool, is the exposed part of the image; None: all of it. `beam` is the axis of LPS that the beam
+    runs along.
 
     Raises `InputError` if the grey values are inverted, which would mislead the similarity even where the landmarks are
     found, if fewer than four landmarks are of use or agree, if the bones drawn at the pose cover those that the
@@ -117,7 +132,7 @@ def find_start(
     points = torch.stack([landmarks[names[i]] for i in usable]).double()
     spread = torch.tensor(anatomy.landmark_spread_mm, dtype=torch.float64)[usable]
     seen = (detection.pixels[usable], camera, detection.confidence[usable], detection.deviation_px[usable])
-    pnp = solve_pnp(points, *seen, spread)
+    pnp = solve_pnp(points, *seen, spread, beam)
     used = [names[i] for i in usable]
     if outline is None:
         _check_rotation(pnp)
@@ -146,11 +161,17 @@ def _check_rotation(pnp: PnpResult) -> None:
 
 
 def look_at(scene: Scene, view: int, find: Detector) -> Detection:
-    """What `find` sees in the first image of a view (from 0); landmarks outside its exposed field are not visible."""
-    image, field = scene.image(scene.first_kind, view), scene.field(scene.first_kind, view)
-    if field is None:
-        return find(image, scene.carm.camera)
-    return within_field(find(filled(image, field), scene.carm.camera), field)
+    """What `find` sees in the first image of a view (from 0); landmarks outside its exposed field are not visible.
+
+    `find` is shown the patient's left on the right.
+    """
+    image, field, camera = scene.image(scene.first_kind, view), scene.field(scene.first_kind, view), scene.carm.camera
+    shown = image if field is None else filled(image, field)
+    if view in scene.left_on_left:
+        found = as_stored(find(shown.flip(-1), camera.mirrored()), _MIRRORED, camera.mirrored())
+    else:
+        found = find(shown, camera)
+    return found if field is None else within_field(found, field)
 
 
 def with_segmentations(scene: Scene, first: Detection, find: Detector) -> Scene:

@@ -88,7 +88,7 @@ def test_one_kind_of_images_needs_no_name(tmp_path: Path) -> None:
     case = read_case(write(tmp_path, content | {"objects": objects, "views": [{"image": "a.tif"}]}))
     assert case.kinds == ("image",)
     write_case(tmp_path, case)
-    assert yaml.safe_load((tmp_path / "case.yaml").read_text())["views"] == [{"image": "a.tif", "intensity": "raw"}]
+    assert yaml.safe_load((tmp_path / "case.yaml").read_text())["views"] == [{"image": "a.tif"}]
 
 
 BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [

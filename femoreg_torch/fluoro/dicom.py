@@ -1,0 +1,188 @@
+"""Pixels of DICOM X-ray images (XA, RF, CR, DX) as intensities or their logarithms (PS3.3 C.7.6.3, C.8.7, C.8.11).
+
+Windows (VOI LUT) and presentation LUTs are for looking: they cut grey values off and bend them, and are not applied.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro.tags import Tags, read_tags
+
+Frames = tuple[int, ...] | Literal["mean"]  # of a cine run: numbers from 1, averaged, or all of them
+Values = NDArray[Any]
+_RADIOGRAPHS = ("CR", "DX")  # which are shown with bone bright, where fluoroscopy has it dark
+
+
+@dataclass(frozen=True)
+class DicomImage:
+    """One image of a DICOM file."""
+
+    values: Values  # (H, W): bone dark where `intensity` is not log
+    tags: Tags
+    intensity: Literal["raw", "log"] | None  # what the header says the values are
+    padding: NDArray[np.bool_] | None  # (H, W) pixels that hold no image
+    remarks: tuple[str, ...]  # for the user
+    asks: str | None  # what the header leaves open and the case has to say: a question in words
+
+
+def carm_settings(path: Path) -> dict[str, Any]:
+    """Settings of a C-arm, for `carm_from_dict`, from the header of a DICOM image.
+
+    Raises `InputError` that names the tags that are missing.
+    """
+    tags = _tags(_dataset(path, stop_before_pixels=True), path)
+    told = {"sdd_mm": tags.sdd_mm, "pixel_mm": tags.pixel_mm, "shape": tags.shape}
+    names = {"sdd_mm": "DistanceSourceToDetector", "pixel_mm": "ImagerPixelSpacing", "shape": "Rows, Columns"}
+    if missing := [key for key, value in told.items() if value is None]:
+        raise InputError(
+            f"{path}: the header does not say {', '.join(f'`{key}` ({names[key]})' for key in missing)}. Write the "
+            "C-arm's settings under `carm:`: sdd_mm, pixel_mm and shape."
+        )
+    found: dict[str, Any] = {key: list(v) if isinstance(v, tuple) else v for key, v in told.items()}
+    if tags.principal_point_px is not None:
+        found["principal_point_px"] = list(tags.principal_point_px)
+    return found
+
+
+def _dataset(path: Path, **options: Any) -> Any:
+    import pydicom  # a fifth of a second, and most images are of other kinds
+    from pydicom.errors import InvalidDicomError
+
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such file.")
+    try:
+        return pydicom.dcmread(path, **options)
+    except InvalidDicomError as error:
+        raise InputError(f"{path}: not a DICOM file, and its name ends in no known suffix of an image.") from error
+
+
+def _tags(dataset: Any, path: Path) -> Tags:
+    try:
+        return read_tags(dataset)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def read_dicom(path: Path, frames: Frames | None) -> DicomImage:
+    """An image of a DICOM file; several frames are averaged.
+
+    Raises `InputError` for a file that is no DICOM image, for a cine run without `frames`, for frames that it does not
+    have or whose C-arm moved, and for a colour image.
+    """
+    dataset = _dataset(path)
+    tags = _tags(dataset, path)
+    stored = _pixels(dataset, _numbers(dataset, frames, path), path)
+    if stored.ndim == 3 and stored.shape[-1] == 3:
+        if (stored != stored[..., :1]).any():
+            return DicomImage(stored, tags, None, None, (), None)  # refused by its shape
+        stored = stored[..., 0]
+    padding = _padding(dataset, stored)
+    relation = str(dataset.get("PixelIntensityRelationship") or "")
+    values, lowest, highest, linear = _after_modality(dataset, stored, relation)
+    sign = dataset.get("PixelIntensityRelationshipSign")
+    inverted = sign == -1 if sign is not None else dataset.get("PhotometricInterpretation") == "MONOCHROME1"
+    if inverted and not linear:  # a LUT to linear values says itself which are high
+        values = lowest + highest - values
+    remarks: list[str] = []
+    asks: str | None = None
+    intensity: Literal["raw", "log"] | None = None
+    if relation == "LIN" or linear:
+        intensity = "raw"
+    elif relation == "LOG":
+        intensity = "log"
+        values = values.max() - values  # with the sign taken care of, bone is dark; attenuation has it bright
+        remarks.append("holds logarithms of unknown base, so that materials cannot be told from them")
+    elif relation == "DISP":
+        remarks.append("was processed for display: its grey values are no intensities")
+        asks = "was processed for display (PixelIntensityRelationship DISP)"
+    elif tags.modality in _RADIOGRAPHS:
+        asks = f"is a radiograph ({tags.modality}) and does not say what its values are (PixelIntensityRelationship)"
+    if str(dataset.get("LossyImageCompression") or "") == "01":
+        remarks.append("was compressed with loss")
+    return DicomImage(values, tags, intensity, padding, tuple(remarks), asks)
+
+
+def _numbers(dataset: Any, frames: Frames | None, path: Path) -> tuple[int, ...]:
+    """Which frames are meant, from 0."""
+    count = int(dataset.get("NumberOfFrames") or 1)
+    if frames is None:
+        if count > 1:
+            raise InputError(
+                f"{path}: holds {count} frames, one was expected. Name one in the view, `frames: 1`, several to be "
+                "averaged, `frames: [1, 2]`, or `frames: mean`."
+            )
+        return (0,)
+    chosen: Sequence[int] = range(1, count + 1) if frames == "mean" else frames
+    if outside := [n for n in chosen if not 1 <= n <= count]:
+        raise InputError(f"{path}: there is no frame {outside[0]}, it holds {count}, numbered from 1.")
+    if len(chosen) > 1 and dataset.get("PositionerMotion") == "DYNAMIC":
+        raise InputError(f"{path}: the C-arm moved during this run, so frames cannot be averaged. Name one frame.")
+    return tuple(n - 1 for n in chosen)
+
+
+def _pixels(dataset: Any, frames: tuple[int, ...], path: Path) -> Values:
+    """Stored values (H, W), or (H, W, 3); the mean, float64, of several frames."""
+    from pydicom.pixels import pixel_array
+
+    try:
+        packed = dataset.file_meta.TransferSyntaxUID.is_compressed
+        read = [pixel_array(dataset, index=n, correct_unused_bits=packed) for n in frames]
+        read = read if packed else [_stored_bits(dataset, pixels) for pixels in read]
+    except (AttributeError, IndexError, KeyError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: the DICOM file holds no image that can be decoded ({reason}).") from error
+    return read[0] if len(read) == 1 else np.mean(read, axis=0)
+
+
+def _stored_bits(dataset: Any, pixels: Values) -> Values:
+    """Pixels without what else may stand in unused bits, such as overlays; the bits that are used end at HighBit."""
+    if pixels.dtype.kind not in "iu" or pixels.ndim != 2:
+        return pixels
+    stored, high = int(dataset.BitsStored), int(dataset.get("HighBit", dataset.BitsStored - 1))
+    shift, width = high + 1 - stored, 8 * pixels.dtype.itemsize
+    if shift < 0 or stored > width or (shift == 0 and stored == width):
+        return pixels
+    bits = (pixels.view(f"u{pixels.dtype.itemsize}").astype(np.int64) >> shift) & (2**stored - 1)
+    if dataset.PixelRepresentation:
+        bits = np.where(bits >= 2 ** (stored - 1), bits - 2**stored, bits)
+    return bits
+
+
+def _padding(dataset: Any, stored: Values) -> NDArray[np.bool_] | None:
+    """Pixels (H, W) that hold no image, by PixelPaddingValue (and its range)."""
+    value = dataset.get("PixelPaddingValue")
+    if value is None:
+        return None
+    low, high = sorted((int(value), int(dataset.get("PixelPaddingRangeLimit", value))))
+    padding = (stored >= low) & (stored <= high)
+    return padding if padding.any() else None
+
+
+def _after_modality(dataset: Any, stored: Values, relation: str) -> tuple[Values, float, float, bool]:
+    """Values after the modality LUT, their least and greatest possible, and whether a LUT made logarithms linear.
+
+    In X-ray images the modality LUT of logarithmic pixels leads back to values that are linear in the intensity of the
+    beam; enhanced images say so in a LUT of their own (TO_LINEAR).
+    """
+    from pydicom.pixels import apply_modality_lut
+
+    bits = int(dataset.get("BitsStored", 16))
+    lowest = -(2 ** (bits - 1)) if dataset.get("PixelRepresentation") else 0
+    ends = np.array([lowest, lowest + 2**bits - 1])
+    for item in dataset.get("PixelIntensityRelationshipLUTSequence") or ():
+        if item.get("LUTFunction") == "TO_LINEAR":
+            dataset.ModalityLUTSequence = [item]  # in place of what the file has for display
+    has_table = bool(dataset.get("ModalityLUTSequence"))
+    whole = np.rint(stored).astype(np.int64) if has_table else stored
+    values = apply_modality_lut(whole, dataset).astype(np.float64)
+    if "BitsStored" not in dataset:  # floating-point pixels
+        low, high = float(stored.min()), float(stored.max())
+    else:
+        low, high = sorted(float(v) for v in apply_modality_lut(ends, dataset))
+    return values, low, high, relation == "LOG" and has_table

@@ -1,0 +1,256 @@
+"""DICOM X-ray images, as pydicom writes them: values, frames, and what the header says against a case."""
+
+from pathlib import Path
+
+import numpy as np
+import pydicom
+import pytest
+from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import (
+    SOURCES,
+    Circle,
+    Display,
+    Polygon,
+    Tags,
+    carm_settings,
+    contradictions,
+    read_stored,
+    side_remarks,
+)
+from femoreg_torch.fluoro import settled_intensity as settled
+from femoreg_torch.geometry import Camera, Uncertainty
+
+PIXELS = np.random.default_rng(3).integers(1, 4096, (5, 7), dtype=np.uint16)
+CAMERA = Camera(1000.0, (0.2, 0.2), (5, 7), (3.0, 2.0))
+
+
+def write(folder: Path, pixels: np.ndarray = PIXELS, **fields: object) -> Path:
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID = XRayAngiographicImageStorage
+    meta.MediaStorageSOPInstanceUID = "1.2.3"
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    path = folder / "run.dcm"
+    dataset = FileDataset(str(path), {}, file_meta=meta, preamble=b"\0" * 128)
+    settings = {
+        "SOPClassUID": meta.MediaStorageSOPClassUID,
+        "SOPInstanceUID": "1.2.3",
+        "Modality": "XA",
+        "Rows": pixels.shape[-2],
+        "Columns": pixels.shape[-1],
+        "SamplesPerPixel": 1,
+        "PhotometricInterpretation": "MONOCHROME2",
+        "BitsAllocated": 8 * pixels.dtype.itemsize,
+        "BitsStored": 12 if pixels.dtype.itemsize == 2 else 8,
+        "HighBit": 11 if pixels.dtype.itemsize == 2 else 7,
+        "PixelRepresentation": 0,
+        "PixelData": pixels.tobytes() + b"\0" * (pixels.nbytes % 2),
+    } | fields
+    for name, value in settings.items():
+        setattr(dataset, name, value)
+    pydicom.dcmwrite(path, dataset)
+    return path
+
+
+def values(path: Path, **options: object) -> np.ndarray:
+    return read_stored(path, **options).values.numpy()  # type: ignore[arg-type]
+
+
+def test_bits_that_hold_no_pixel_are_left_out(tmp_path: Path) -> None:
+    overlay = PIXELS | np.uint16(0xA000)  # as retired overlays in the upper bits
+    np.testing.assert_array_equal(values(write(tmp_path, overlay)), PIXELS)
+    shifted = (PIXELS << 4).astype(np.uint16) | np.uint16(0x000B)
+    np.testing.assert_array_equal(values(write(tmp_path, shifted, HighBit=15)), PIXELS)
+    signed = PIXELS.astype(np.int16) - 2048
+    np.testing.assert_array_equal(values(write(tmp_path, signed & 0x0FFF, PixelRepresentation=1)), signed)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_all_depths_and_both_photometric_interpretations_give_one_image(tmp_path: Path, bits: int) -> None:
+    dtype = np.uint8 if bits == 8 else np.uint16
+    pixels = (PIXELS.astype(np.int64) * (2**bits - 1) // 4095).astype(dtype)
+    depth = {"BitsStored": bits, "HighBit": bits - 1}
+    plain = values(write(tmp_path, pixels, **depth))
+    np.testing.assert_array_equal(plain, pixels)
+    inverse = (2**bits - 1 - pixels.astype(np.int64)).astype(dtype)
+    shown_so = write(tmp_path, inverse, PhotometricInterpretation="MONOCHROME1", **depth)
+    np.testing.assert_array_equal(values(shown_so), plain)
+    signed = {"PixelIntensityRelationship": "LIN", "PixelIntensityRelationshipSign": -1}
+    np.testing.assert_array_equal(values(write(tmp_path, inverse, **depth, **signed)), plain)
+    # The sign tells what is physical; how it is shown does not matter then.
+    signed = {"PixelIntensityRelationship": "LIN", "PixelIntensityRelationshipSign": 1}
+    raw = write(tmp_path, pixels, PhotometricInterpretation="MONOCHROME1", **depth, **signed)
+    np.testing.assert_array_equal(values(raw), plain)
+
+
+def lut(first: int, entries: np.ndarray) -> Dataset:
+    item = Dataset()
+    item.LUTDescriptor = [len(entries), first, 16]
+    item.ModalityLUTType = "US"
+    item.LUTData = entries.astype("<u2").tobytes()
+    return item
+
+
+def test_a_lut_brings_logarithms_back_to_intensities(tmp_path: Path) -> None:
+    to_linear = np.round(60000 * np.exp((np.arange(4096) - 4095) / 900)).astype(np.uint16)
+    expected = to_linear[PIXELS]
+    path = write(tmp_path, PixelIntensityRelationship="LOG", ModalityLUTSequence=[lut(0, to_linear)])
+    read = read_stored(path)
+    np.testing.assert_array_equal(read.values.numpy(), expected)
+    assert read.intensity == "raw"
+    enhanced = lut(0, to_linear)
+    enhanced.LUTFunction = "TO_LINEAR"
+    path = write(tmp_path, PixelIntensityRelationship="LOG", PixelIntensityRelationshipLUTSequence=[enhanced])
+    np.testing.assert_array_equal(values(path), expected)
+
+
+@pytest.mark.parametrize(
+    ("fields", "attenuation"),
+    [
+        ({}, PIXELS.max() - PIXELS.astype(int)),  # of XA: high where many photons arrive
+        ({"PixelIntensityRelationshipSign": 1}, PIXELS.max() - PIXELS.astype(int)),
+        ({"PixelIntensityRelationshipSign": -1}, PIXELS.astype(int) - PIXELS.min()),
+        ({"PhotometricInterpretation": "MONOCHROME1"}, PIXELS.astype(int) - PIXELS.min()),
+    ],
+)
+def test_logarithms_without_a_lut_have_bright_bone(tmp_path: Path, fields: dict, attenuation: np.ndarray) -> None:
+    read = read_stored(write(tmp_path, PixelIntensityRelationship="LOG", **fields))
+    np.testing.assert_array_equal(read.values.numpy(), attenuation)
+    assert read.intensity == "log"
+    assert "unknown base" in read.remarks[0]
+
+
+def test_windows_are_for_looking_only(tmp_path: Path) -> None:
+    path = write(tmp_path, WindowCenter=100, WindowWidth=50, VOILUTSequence=[lut(0, np.zeros(4096, np.uint16))])
+    np.testing.assert_array_equal(values(path), PIXELS)
+
+
+def test_frames_are_counted_from_one_and_averaged(tmp_path: Path) -> None:
+    run = np.stack([PIXELS, PIXELS[::-1], PIXELS[:, ::-1]])
+    path = write(tmp_path, run, NumberOfFrames=3)
+    np.testing.assert_array_equal(values(path, frames=(2,)), PIXELS[::-1])
+    np.testing.assert_allclose(values(path, frames=(1, 3)), (run[0].astype(float) + run[2]) / 2)
+    np.testing.assert_allclose(values(path, frames="mean"), run.mean(0, dtype=np.float64), rtol=1e-6)
+    inverse = write(tmp_path, (4095 - run).astype(np.uint16), NumberOfFrames=3, PhotometricInterpretation="MONOCHROME1")
+    np.testing.assert_allclose(values(inverse, frames="mean"), run.mean(0, dtype=np.float64), rtol=1e-6)
+    with pytest.raises(InputError, match=r"no frame 4, it holds 3"):
+        values(path, frames=(4,))
+    with pytest.raises(InputError, match="the C-arm moved"):
+        values(write(tmp_path, run, NumberOfFrames=3, PositionerMotion="DYNAMIC"), frames="mean")
+
+
+def test_what_the_values_are_is_settled_between_file_and_case(tmp_path: Path) -> None:
+    linear = read_stored(write(tmp_path, PixelIntensityRelationship="LIN"))
+    silent, shown = read_stored(write(tmp_path)), read_stored(write(tmp_path, PixelIntensityRelationship="DISP"))
+    radiograph = read_stored(write(tmp_path, Modality="DX"))
+    assert settled(None, linear, "a") == settled("raw", linear, "a") == settled(None, silent, "a") == "raw"
+    assert settled("log", silent, "a") == settled("log", shown, "a") == "log"
+    with pytest.raises(InputError, match=r"a holds intensities \(raw\) by its PixelIntensityRelationship"):
+        settled("log", linear, "a")
+    for asked in (shown, radiograph):
+        with pytest.raises(InputError, match="Say so in the view"):
+            settled(None, asked, "a")
+
+
+def test_padding_and_shutters_are_no_image(tmp_path: Path) -> None:
+    assert read_stored(write(tmp_path)).padding is None
+    padded = PIXELS.copy()
+    padded[0] = 0
+    read = read_stored(write(tmp_path, padded, PixelPaddingValue=0))
+    np.testing.assert_array_equal(read.padding, padded == 0)
+    round_ = {"ShutterShape": "CIRCULAR", "CenterOfCircularShutter": [3, 4], "RadiusOfCircularShutter": 2}
+    assert read_stored(write(tmp_path, **round_)).tags.field == Circle((3.0, 2.0), 2.0)  # type: ignore[union-attr]
+    edges = dict(
+        zip(("LeftVertical", "RightVertical", "UpperHorizontal", "LowerHorizontal"), (2, 6, 1, 4), strict=True)
+    )
+    square = {"CollimatorShape": "RECTANGULAR"} | {f"Collimator{name}Edge": n for name, n in edges.items()}
+    corners = ((1.0, 0.0), (5.0, 0.0), (5.0, 3.0), (1.0, 3.0))
+    assert read_stored(write(tmp_path, **square)).tags.field == Polygon(corners)  # type: ignore[union-attr]
+
+
+_USUAL = Display()
+
+
+def told(folder: Path, display: Display = _USUAL, uncertainty: Uncertainty | None = None, **tags: object) -> str:
+    read = read_stored(write(folder, **tags)).tags
+    assert isinstance(read, Tags)
+    return "; ".join([*contradictions(read, CAMERA, display, uncertainty), *side_remarks(read, display)])
+
+
+def test_lengths_of_header_and_case(tmp_path: Path) -> None:
+    assert told(tmp_path, DistanceSourceToDetector=1004, ImagerPixelSpacing=[0.2, 0.2]) == ""
+    assert "DistanceSourceToDetector is 1100 mm" in told(tmp_path, DistanceSourceToDetector=1100)
+    assert told(tmp_path, uncertainty=Uncertainty(sdd_percent=4), DistanceSourceToDetector=1100) == ""
+    assert "ImagerPixelSpacing (row, column) is 0.2, 0.4 mm" in told(tmp_path, ImagerPixelSpacing=[0.2, 0.4])
+    assert told(tmp_path, PixelSpacing=[0.5, 0.5]) == ""  # in whatever plane
+    with pytest.raises(InputError, match=r"run\.dcm: DICOM tag ImagerPixelSpacing: a positive number"):
+        read_stored(write(tmp_path, ImagerPixelSpacing=[0.2, -1]))
+
+
+@pytest.mark.parametrize(
+    ("tags", "sides"),
+    [
+        ({"PositionerPrimaryAngle": 0}, {"posterior"}),  # the detector in front
+        ({"PositionerPrimaryAngle": -180}, {"anterior"}),
+        ({"PositionerPrimaryAngle": 90}, {"right"}),  # the detector at the patient's left
+        ({"PositionerPrimaryAngle": -40}, {"posterior", "left"}),
+        ({"ViewPosition": "AP"}, {"anterior"}),
+        ({"ViewPosition": "PA"}, {"posterior"}),
+        ({"ViewPosition": "LLD"}, {"anterior", "posterior", "left", "right"}),
+    ],
+)
+def test_the_side_of_the_source(tmp_path: Path, tags: dict, sides: set[str]) -> None:
+    fits = {side for side in SOURCES if not told(tmp_path, Display(side), **tags)}
+    assert fits == sides
+
+
+@pytest.mark.parametrize(
+    ("orientation", "display"),
+    [
+        (["L", "F"], Display()),
+        (["R", "F"], Display(mirrored=True)),
+        (["R", "H"], Display(turned_deg=180)),
+        (["H", "L"], Display(turned_deg=90)),  # what led right leads down
+        (["F", "R"], Display(turned_deg=270)),
+        (["F", "L"], Display(mirrored=True, turned_deg=270)),
+        (["LP", "FR"], Display("posterior")),
+        (["A", "F"], Display("left", mirrored=True)),
+        (["P", "F"], Display("right")),
+    ],
+)
+def test_the_orientation_of_the_picture(tmp_path: Path, orientation: list[str], display: Display) -> None:
+    assert told(tmp_path, display, PatientOrientation=orientation) == ""
+    other = Display(display.source, not display.mirrored, display.turned_deg)
+    assert "PatientOrientation" in told(tmp_path, other, PatientOrientation=orientation)
+
+
+@pytest.mark.parametrize(("rotation", "flip"), [(0, "NO"), (90, "NO"), (180, "YES"), (270, "YES"), (90, "YES")])
+def test_a_field_that_is_not_in_the_middle_moves_the_principal_point(tmp_path: Path, rotation: int, flip: str) -> None:
+    """The header, against a marked pixel at the middle of a detector that is cut, turned and mirrored."""
+    detector = np.zeros((41, 61), np.uint16)
+    detector[20, 30] = 4000  # the middle
+    field = detector[12:31, 19:40]
+    stored = np.rot90(field, -rotation // 90)  # clockwise
+    stored = stored[:, ::-1] if flip == "YES" else stored
+    path = write(
+        tmp_path,
+        np.ascontiguousarray(stored),
+        ImagerPixelSpacing=[0.3, 0.3],
+        DistanceSourceToDetector=900,
+        FieldOfViewOrigin=[12, 19],
+        FieldOfViewRotation=rotation,
+        FieldOfViewHorizontalFlip=flip,
+        DetectorElementSpacing=[0.3, 0.3],
+        DetectorActiveDimensions=[41 * 0.3, 61 * 0.3],
+    )
+    row, column = np.argwhere(stored)[0]
+    found = carm_settings(path)
+    assert found["principal_point_px"] == pytest.approx([column, row])
+    assert (found["sdd_mm"], found["pixel_mm"], found["shape"]) == (900, [0.3, 0.3], list(stored.shape))
+
+
+def test_a_header_with_gaps_tells_no_carm(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"does not say `sdd_mm` \(DistanceSourceToDetector\)"):
+        carm_settings(write(tmp_path, ImagerPixelSpacing=[0.2, 0.2]))

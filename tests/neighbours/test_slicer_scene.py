@@ -1,0 +1,87 @@
+"""A scene of 3D Slicer: its nodes name each other and files that exist, and the files hold what was registered."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from femoreg_torch.case import Case, CaseObject, Model, PlannedPath, Result, Start
+from femoreg_torch.errors import InputError
+from femoreg_torch.files import read_json
+from femoreg_torch.geometry import Poses, exp_se3, invert_rigid, load_carm
+from femoreg_torch.neighbours.slicer import surface_of, write_scene
+from femoreg_torch.neighbours.xreg import read_transform
+from femoreg_torch.volume import Volume, read_mesh
+
+float64 = torch.float64
+
+
+def pose(seed: float) -> torch.Tensor:
+    return exp_se3(torch.tensor([0.1 * seed, -0.2, 0.3 * seed, 5 * seed, -7, 600], dtype=float64))
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    for name, size in (("block", (12, 9, 7)), ("rod", (5, 5, 30))):
+        trimesh.creation.box(size).export(tmp_path / f"{name}.stl")
+    point = {name: torch.tensor([0.0, 0, z], dtype=float64) for name, z in (("base", -15), ("tip", 15))}
+    objects = {
+        "block": CaseObject("block", model=Model(tmp_path / "block.stl", 500.0), start=Start(pose(1))),
+        "rod": CaseObject("rod", model=Model(tmp_path / "rod.stl", 3000.0), points=point, start=Start(pose(2))),
+    }
+    plan = PlannedPath(
+        "block", torch.tensor([1.0, 2, 3], dtype=float64), torch.tensor([0.0, 0, 0], dtype=float64), "rod"
+    )
+    case = Case(tmp_path, load_carm("cios_fusion"), objects, landmarks={"corner": point["tip"]}, plan=plan)
+    poses = Poses(torch.eye(4, dtype=float64)[None], {"block": pose(1), "rod": pose(2)})
+    result = Result(poses, {})
+    (tmp_path / "slicer").mkdir()
+    names = write_scene(tmp_path / "slicer", case, result)
+    assert sorted(names) == sorted(path.name for path in (tmp_path / "slicer").iterdir())
+    return tmp_path / "slicer"
+
+
+def test_nodes_and_files(scene: Path) -> None:
+    root = ElementTree.parse(scene / "scene.mrml").getroot()
+    nodes = {node.get("id"): node for node in root}
+    assert len(nodes) == len(root)
+    for node in root:
+        for key in ("storageNodeRef", "displayNodeRef", "transformNodeRef"):
+            assert node.get(key) is None or node.get(key) in nodes
+        assert node.get("fileName") is None or (scene / node.get("fileName", "")).is_file()
+    below = {node.get("name"): node.get("transformNodeRef") for node in root if "storageNodeRef" in node.attrib}
+    (transform,) = (node.get("id") for node in root if node.tag == "LinearTransform")
+    assert below == {
+        "block": None, "path": None, "landmarks": None, "rod": transform, "guide": transform, "block_from_rod": None
+    }  # fmt: skip
+
+
+def test_what_the_files_hold(scene: Path) -> None:
+    # ITK's direction: takes points of the parent to those of what hangs below
+    expected = invert_rigid(pose(2)) @ pose(1)
+    torch.testing.assert_close(read_transform(scene / "block_from_rod.tfm"), expected, atol=1e-6, rtol=0)
+    for name, size in (("block", (12, 9, 7)), ("rod", (5, 5, 30))):
+        assert b"SPACE=LPS" in (scene / f"{name}.stl").read_bytes()[:80]
+        mesh = read_mesh(scene / f"{name}.stl")
+        np.testing.assert_allclose(mesh.bounds, np.array([-0.5, 0.5])[:, None] * size, atol=0.35)
+        assert mesh.volume > 0.85 * np.prod(size)  # its faces look outwards
+    (line,) = read_json(scene / "guide.mrk.json")["markups"]
+    assert line["coordinateSystem"] == "LPS"
+    assert [point["position"] for point in line["controlPoints"]] == [[0, 0, -15], [0, 0, 15]]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_surface_lies_where_its_mask_does_whatever_the_axes(sign: float) -> None:
+    affine = torch.diag(torch.tensor([sign, 1.0, 2.0, 1.0], dtype=float64))
+    affine[:3, 3] = torch.tensor([10.0, 20, 30], dtype=float64)
+    data = torch.zeros(8, 10, 12)
+    data[2:6, 3:8, 4:11] = 1
+    mesh = surface_of(Volume(data, affine), "box")
+    middle = affine[:3, :3] @ torch.tensor([7.0, 5, 3.5], dtype=float64) + affine[:3, 3]
+    np.testing.assert_allclose(mesh.bounds.mean(0), middle, atol=1e-6)
+    assert mesh.volume > 0
+    with pytest.raises(InputError, match="box: has no voxel"):
+        surface_of(Volume(torch.zeros(3, 3, 3), affine), "box")

@@ -1,0 +1,145 @@
+"""One scene stored in every way: the images inside, their fields and the start from landmarks are the same."""
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import pydicom
+import pytest
+import torch
+import trimesh
+from pydicom.dataset import FileDataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
+
+from femoreg_torch.anatomy import HIP
+from femoreg_torch.case import Case, CaseObject, Model, Start, View, read_case, write_case
+from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import Circle, Display, write_image
+from femoreg_torch.geometry import Camera, CArm, exp_se3, project_points, transform_points
+from femoreg_torch.registration.prepare import read_images
+from femoreg_torch.registration.start import start_by_landmarks
+
+float64 = torch.float64
+CAMERA = Camera(1000.0, (1.5, 1.4), (40, 50), (26.0, 18.0))  # as the source sees it; nothing of it is symmetric
+RAW = torch.randint(1000, 60000, (40, 50), generator=torch.Generator().manual_seed(0))
+DISPLAYS = [
+    Display(source, mirrored, turned)  # type: ignore[arg-type]
+    for source, mirrored, turned in itertools.product(("anterior", "posterior"), (False, True), (0, 90, 180, 270))
+]
+
+
+def write_dicom(path: Path, pixels: torch.Tensor, photometric: str, **fields: object) -> None:
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID = XRayAngiographicImageStorage
+    meta.MediaStorageSOPInstanceUID = "1.2.3"
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    dataset = FileDataset(str(path), {}, file_meta=meta, preamble=b"\0" * 128)
+    settings = {
+        "SOPClassUID": meta.MediaStorageSOPClassUID,
+        "SOPInstanceUID": "1.2.3",
+        "Modality": "XA",
+        "Rows": pixels.shape[0],
+        "Columns": pixels.shape[1],
+        "SamplesPerPixel": 1,
+        "PhotometricInterpretation": photometric,
+        "BitsAllocated": 16,
+        "BitsStored": 16,
+        "HighBit": 15,
+        "PixelRepresentation": 0,
+        "PixelData": (pixels if photometric == "MONOCHROME2" else 65535 - pixels).to(torch.uint16).numpy().tobytes(),
+    } | fields
+    for name, value in settings.items():
+        setattr(dataset, name, value)
+    pydicom.dcmwrite(path, dataset)
+
+
+def case_of(folder: Path, display: Display, image: str, **told: object) -> Case:
+    """The case as it comes back from its folder."""
+    trimesh.creation.box((20, 20, 20)).export(folder / "block.stl")
+    nominal = Start(camera1_from=torch.eye(4, dtype=float64))
+    objects = {"block": CaseObject("block", model=Model(folder / "block.stl", 500.0), start=nominal)}
+    carm = CArm(CAMERA, (0.0, 0.0, 620.0), (0.0, 1.0, 0.0))
+    view = View({"image": folder / image}, None, field=told.get("field"))  # type: ignore[arg-type]
+    write_case(folder, Case(folder, carm, objects, views=(view,), display=display))
+    case = read_case(folder)
+    assert case.carm == carm
+    assert case.display == display
+    return case
+
+
+@pytest.mark.parametrize("photometric", ["MONOCHROME1", "MONOCHROME2"])
+@pytest.mark.parametrize("display", DISPLAYS, ids=str)
+def test_images_and_fields_are_the_same_bit_by_bit(tmp_path: Path, display: Display, photometric: str) -> None:
+    write_dicom(tmp_path / "view.dcm", display.to_stored(RAW), photometric)
+    centre = display.pixels_to_stored(torch.tensor([20.0, 25.0]), CAMERA).tolist()
+    case = case_of(tmp_path, display, "view.dcm", field=Circle((centre[0], centre[1]), 12.0))
+    images, fields, told = read_images(case)
+    write_image(tmp_path / "plain.tif", RAW.to(torch.uint16))
+    plain, plain_fields, _ = read_images(case_of(tmp_path, Display(), "plain.tif", field=Circle((20.0, 25.0), 12.0)))
+    assert torch.equal(images["image"][0], plain["image"][0])  # type: ignore[arg-type]
+    assert torch.equal(fields["image"][0], plain_fields["image"][0])  # type: ignore[arg-type]
+    assert told == ()
+
+
+@pytest.mark.parametrize("display", [*DISPLAYS, Display("left"), Display("right", turned_deg=90)], ids=str)
+def test_landmarks_in_the_stored_picture_start_from_every_side(tmp_path: Path, display: Display) -> None:
+    camera = replace(CAMERA, pixel_mm=(0.5, 0.5), shape=(700, 600), principal_point_px=(300.0, 350.0))
+    generator = torch.Generator().manual_seed(1)
+    points = (torch.rand(14, 3, generator=generator, dtype=float64) - 0.5) * torch.tensor([220.0, 120.0, 180.0])
+    forward, down = torch.tensor(display.beam, dtype=float64), torch.tensor([0.0, 0, -1], dtype=float64)
+    upright = torch.eye(4, dtype=float64)
+    upright[:3, :3] = torch.stack([torch.linalg.cross(down, forward), down, forward])
+    upright[2, 3] = 640.0
+    truth = exp_se3(torch.tensor([0.1, -0.15, 0.05, 4, -6, 10], dtype=float64)) @ upright
+    stored = display.pixels_to_stored(project_points(camera, transform_points(truth, points)), camera)
+    landmarks = dict(zip(HIP.landmark_names, points, strict=True))
+    carm = CArm(camera, (0.0, 0.0, 620.0), (0.0, 1.0, 0.0))
+    case = Case(tmp_path, carm, {}, views=(View({}),), landmarks=landmarks, display=display)
+    found = start_by_landmarks(case, "pelvis", dict(zip(HIP.landmark_names, stored, strict=True)))
+    moved = transform_points(found.camera1_from_object, points) - transform_points(truth, points)
+    assert moved.norm(dim=1).max() < 0.05
+    kept = found.landmarks["FH-l"].pixel
+    assert list(kept) == pytest.approx(stored[0].tolist())
+    wrong = replace(case, display=Display(display.source, not display.mirrored, display.turned_deg))
+    with pytest.raises(InputError, match="landmarks"):
+        start_by_landmarks(wrong, "pelvis", dict(zip(HIP.landmark_names, stored, strict=True)))
+
+
+def test_a_header_against_the_case(tmp_path: Path) -> None:
+    write_dicom(tmp_path / "view.dcm", RAW, "MONOCHROME2", DistanceSourceToDetector=1400)
+    with pytest.raises(InputError, match=r"views\[0\]\.image: view\.dcm, DistanceSourceToDetector is 1400 mm"):
+        read_images(case_of(tmp_path, Display(), "view.dcm"))
+    write_dicom(tmp_path / "view.dcm", RAW, "MONOCHROME2", PositionerPrimaryAngle=5)
+    with pytest.raises(InputError, match=r"patient's posterior side, but the case says right"):
+        read_images(case_of(tmp_path, Display("right"), "view.dcm"))
+    said = "patient's posterior side, but the case says anterior"
+    assert any(said in told for told in read_images(case_of(tmp_path, Display(), "view.dcm"))[2])  # no display, no word
+    assert not any(said in told for told in read_images(case_of(tmp_path, Display("posterior"), "view.dcm"))[2])
+
+
+def test_a_carm_from_the_header(tmp_path: Path) -> None:
+    write_dicom(tmp_path / "view.dcm", RAW, "MONOCHROME2", DistanceSourceToDetector=990, ImagerPixelSpacing=[0.3, 0.2])
+    case_of(tmp_path, Display(turned_deg=90), "view.dcm")
+    text = (tmp_path / "case.yaml").read_text()
+    start, end = text.index("carm:"), text.index("display:")
+    (tmp_path / "case.yaml").write_text(text[:start] + "carm: dicom\n" + text[end:])
+    camera = read_case(tmp_path).carm.camera
+    assert (camera.sdd_mm, camera.pixel_mm, camera.shape) == (990, (0.2, 0.3), (50, 40))  # turned upright
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("display: {source: above}", r"display\.source: anterior or posterior or left or right was expected"),
+        ("display: {turned: 45}", r"display\.turned: degrees clockwise, 0, 90, 180, 270, were expected, found 45"),
+        ("display: {mirrored: 1}", r"display\.mirrored: true or false was expected"),
+        ("display: {side: left}", r"display\.side: unknown key"),
+    ],
+)
+def test_displays_that_cannot_be(tmp_path: Path, line: str, message: str) -> None:
+    write_image(tmp_path / "view.tif", RAW.to(torch.uint16))
+    case_of(tmp_path, Display(), "view.tif")
+    path = tmp_path / "case.yaml"
+    path.write_text(path.read_text() + line + "\n")
+    with pytest.raises(InputError, match=message):
+        read_case(tmp_path)
