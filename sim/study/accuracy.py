@@ -120,7 +120,7 @@ def write_results(
     """
     out.mkdir(parents=True, exist_ok=True)
     text = section(records, total, preset, timing)
-    figure = figures.error_figure(records, f"Errors of `{preset}` on {len(records)} simulated procedures")
+    figure = figures.error_figure(records, f"Errors of the preset “{preset}” on {len(records)} simulated procedures")
     for folder in (out, *([docs] if docs else [])):
         figures.save(figure, folder / f"accuracy_{preset}.png")
     write_csv(out / "runs.csv", rows_of_csv(records))

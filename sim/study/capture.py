@@ -98,7 +98,9 @@ def write_capture(records: Sequence[dict[str, Any]], plan: Plan, out: Path, docs
     rates = success_rates(records)
     names = ", ".join(f"“{step.name}”" for step in first_stages(plan).steps)
     cases = sorted({record["case"] for record in records})
-    figure = figures.capture_figure(rates, AXIS_LABELS, f"Capture range of the pelvis in view 1, `{plan.preset}`")
+    figure = figures.capture_figure(
+        rates, AXIS_LABELS, f"Capture range of the pelvis in view 1, preset “{plan.preset}”"
+    )
     for folder in (out, *([docs] if docs else [])):
         figures.save(figure, folder / f"capture_{plan.preset}.png")
     write_json(out / f"capture_{plan.preset}.json", {"preset": plan.preset, "starts": list(records)})

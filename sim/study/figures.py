@@ -27,7 +27,7 @@ def error_figure(records: Sequence[Record], title: str) -> Figure:
     """A panel per quantity: every run as a point, median and quartiles as a box, procedural and real bones apart."""
     columns = 5
     figure = Figure(figsize=(14, 3.0 * -(-len(QUANTITIES) // columns)), layout="constrained")
-    figure.suptitle(f"{title}\ndashed: mean of the paper; dotted: mean wanted of `fast`", fontsize=11)
+    figure.suptitle(f"{title}\ndashed: mean of the paper; dotted: mean wanted of the preset “fast”", fontsize=11)
     axes = figure.subplots(-(-len(QUANTITIES) // columns), columns, squeeze=False).ravel()
     rng = np.random.default_rng(0)  # of the sideways scatter of the points
     for axis, quantity in zip(axes, QUANTITIES, strict=False):
