@@ -27,8 +27,8 @@ MAY_IMPORT = {
 ROOMS = (
     "errors", "exchange", "files", "extras", "configs", "settings", "extensions", "anatomy",
     "geometry", "volume", "drr", "fluoro", "case",
-    "detect", "pnp", "similarity", "optimize", "registration", "navigation", "planning", "evaluation", "beads",
-    "statistics", "commands",
+    "detect", "pnp", "similarity", "optimize", "registration", "navigation", "planning", "evaluation", "review",
+    "beads", "statistics", "commands",
 )  # fmt: skip
 
 
