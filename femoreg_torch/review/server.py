@@ -21,7 +21,7 @@ from starlette.responses import HTMLResponse, PlainTextResponse, RedirectRespons
 from starlette.routing import Route
 
 from femoreg_torch.case import Result
-from femoreg_torch.case.review import Review, read_review, result_sha256, write_review
+from femoreg_torch.case.review import Decision, Review, read_review, result_sha256, write_review
 from femoreg_torch.navigation.report import NOTICE
 
 LOOPBACK = "127.0.0.1"
@@ -89,7 +89,7 @@ def review_app(run: Path, result: Result, report: str, digest: str, token: str) 
             return page("Nothing was written: the result has changed since. Start the review again.", 409)
         if fields.get("before", "") != ("" if before is None else before.time):
             return page("Nothing was written: somebody has decided meanwhile, see above. Decide again.", 409)
-        decision = "accepted" if fields["decision"] == "accepted" else "rejected"
+        decision: Decision = "accepted" if fields["decision"] == "accepted" else "rejected"
         now = datetime.now(UTC).isoformat(timespec="microseconds")
         write_review(run, Review(decision, fields.get("note", ""), fields["reviewer"], now, digest))
         return RedirectResponse(f"/{token}/", 303, _HEADERS)

@@ -68,6 +68,18 @@ def test_names_of_users_stay_text(case, scene, result, drawn) -> None:
     assert EVIL in page.text_content()
 
 
+def test_numbers_that_are_not_trusted_are_told_without_uncertainty(case, scene, result, drawn) -> None:
+    places = dict.fromkeys(("entry_point", "tip"), torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    ways = dict.fromkeys(("path", "guide"), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    doubted = replace(result, points_camera1=places, directions_camera1=ways)
+    trusted = replace(doubted, quality={name: replace(q, trusted=True) for name, q in result.quality.items()})
+    for found, uncertain in ((trusted, True), (doubted, False)):
+        card = html.fromstring(report_page(case, scene, found, None, drawn)).find_class("card")[0]
+        assert ("not trusted: not to be used" in card.text_content()) is not uncertain
+        assert ("±" in card.text_content()) is uncertain
+        assert "0.00 mm" in card.text_content()
+
+
 def test_there_is_a_panel_for_every_image_with_each_object_in_its_colour(case, scene, result, drawn) -> None:
     page = html.fromstring(report_page(case, scene, result, None, drawn))
     panels = page.find_class("panel")

@@ -115,7 +115,7 @@ def _next(result: Result, found: Guidance | None, sure: GuideUncertainty | None)
             "from landmarks picked by hand (--landmarks)."
         )
         return
-    yield "Look at the images below: the edges must lie on the bones and on the device in every one."
+    yield "Look at the images below: the coloured edges must lie on the edges of the X-ray in every one."
     if found is None:
         yield "To steer a device, take images with it in each view and register again."
     elif sure is not None and _reached(found, sure):

@@ -107,7 +107,7 @@
   const seeFrom = (view) => {
     eye = unit(views[view].from);
     up = views[view].down.map((v) => -v);
-    zoom = 1.5;
+    zoom = 1.3;
   };
   const labels = data.labels.map((label) => ({ ...label, at: sub(label.at, data.centre) }))
     .concat(views.map((view, n) => ({ text: data.views[n].name, at: view.from, beam: true })));
