@@ -21,4 +21,4 @@ def write_preview(path: Path, images: list[ViewImages]) -> None:
 
 
 def _shown(raw: torch.Tensor) -> Picture:
-    return monitor_picture(downsample(attenuation_image(raw), max(1, raw.shape[1] // _PREVIEW_PX)))
+    return monitor_picture(downsample(attenuation_image(raw.float()), max(1, raw.shape[1] // _PREVIEW_PX)))
