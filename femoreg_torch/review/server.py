@@ -28,10 +28,11 @@ LOOPBACK = "127.0.0.1"
 _HOSTS = [LOOPBACK, "localhost"]
 _MOST_BYTES = 40_000  # of a decision
 _POLICY = (
-    "default-src 'none'; style-src 'unsafe-inline'; frame-src 'self'; form-action 'self'; frame-ancestors 'none'; "
-    "base-uri 'none'"
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; frame-src 'self'; form-action 'self'; "
+    "frame-ancestors 'none'; base-uri 'none'"
 )
-_HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
+# With the policy `no-referrer` browsers would hide where a decision comes from, from this server too.
+_HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "same-origin", "X-Content-Type-Options": "nosniff"}
 
 
 def review_app(run: Path, result: Result, report: str, digest: str, token: str) -> Starlette:
