@@ -1,9 +1,8 @@
-"""Packages that only simulation, training, studies or planning import, and the extra that installs them."""
+"""Packages that only simulation, training, studies, planning, films and reviews need, and the extra with each."""
 
 _EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
     "h5py": "sim",
     "manifold3d": "sim",
-    "skimage": "sim",
     "kornia": "train",
     "lightning": "train",
     "tensorboard": "train",
@@ -14,6 +13,9 @@ _EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
     "psutil": "study",
     "pyamg": "plan",
     "meshio": "plan",
+    "imageio_ffmpeg": "video",
+    "starlette": "review",
+    "uvicorn": "review",
     "pyarrow": "all",  # in both `study` and `plan`
     "matplotlib": "all",  # in `train`, `study` and `plan`
 }

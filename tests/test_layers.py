@@ -28,7 +28,7 @@ ROOMS = (
     "errors", "exchange", "files", "extras", "configs", "settings", "extensions", "anatomy",
     "geometry", "volume", "drr", "fluoro", "case",
     "detect", "pnp", "similarity", "optimize", "registration", "navigation", "neighbours", "planning",
-    "evaluation", "beads", "intake", "statistics", "commands",
+    "evaluation", "review", "beads", "intake", "statistics", "commands",
 )  # fmt: skip
 
 

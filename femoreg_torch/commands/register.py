@@ -108,10 +108,11 @@ def register_into(
     from dataclasses import replace
 
     from femoreg_torch.case import RESULT_NAME, new_folder, read_case, result_content, write_json
+    from femoreg_torch.case.review import REVIEW_NAME
     from femoreg_torch.case.start_files import read_pixels, read_start_poses
     from femoreg_torch.drr import CPU
     from femoreg_torch.errors import InputError
-    from femoreg_torch.evaluation import EVALUATION_NAMES, evaluate
+    from femoreg_torch.evaluation import EVALUATION_NAMES, REPLAY_NAMES, evaluate
     from femoreg_torch.navigation import NAVIGATION_NAMES, navigation_content, read_robot, write_navigation
     from femoreg_torch.registration.run import network_detector, register_scene, silent
 
@@ -135,7 +136,7 @@ def register_into(
         result, errors=evaluate(case, result, scene), case=os.path.relpath(folder.resolve(), out.resolve())
     )
     navigation = None if result.object_from_tool is None else navigation_content(result, calibration)
-    with new_folder(out, without=(*EVALUATION_NAMES, *NAVIGATION_NAMES, "replay.gif")) as built:
+    with new_folder(out, without=(*EVALUATION_NAMES, *NAVIGATION_NAMES, *REPLAY_NAMES, REVIEW_NAME)) as built:
         write_json(built / RESULT_NAME, result_content(result))
         if navigation is not None:
             write_navigation(built, navigation)

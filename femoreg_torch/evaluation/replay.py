@@ -14,8 +14,9 @@ from torch import Tensor
 from femoreg_torch.case import Case, Result, Verdict
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
+from femoreg_torch.evaluation.colours import OBJECT_COLOURS, Colour, object_colours
 from femoreg_torch.evaluation.fit import check_fits
-from femoreg_torch.evaluation.overlay import GREEN, RED, Picture, edges_of, monitor_picture, new_objects, small_field
+from femoreg_torch.evaluation.overlay import Picture, monitor_picture, new_objects, paint_edges, small_field
 from femoreg_torch.files import temporary_file
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, Poses
@@ -27,7 +28,12 @@ _PANEL_PX = 256  # width of one image, or a little more: the detector is average
 _BAR_PX = 22  # height of a line of text
 _PATCH_RADIUS = 5  # of the similarity that is told below each image, pixels
 _MOMENT_MS, _STAGE_MS, _END_MS = 120, 700, 4000
+_FPS = 25
+_CODECS = {".mp4": ("libx264",), ".webm": ("libvpx-vp9", "-deadline", "realtime", "-cpu-used", "8")}  # codec, options
+SUFFIXES = (".gif", *_CODECS)
+REPLAY_NAMES = tuple(f"replay{suffix}" for suffix in SUFFIXES)
 _WHITE, _GREY = (235, 235, 235), (150, 150, 150)
+_GOOD, _BAD = (233, 180, 86), (60, 60, 255)  # blue, green, red
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,24 +49,53 @@ class Frame:
 
 
 def write_replay(path: Path, case: Case, result: Result) -> None:
-    """Write the replay of a result as an animated GIF, whole or not at all.
+    """Write the replay of a result, whole or not at all: an animated GIF, or a film as MP4 (H.264) or WebM (VP9).
 
     Raises `InputError` for another suffix, or a result that does not fit the case or holds no moments.
     """
-    if path.suffix.lower() != ".gif":
-        raise InputError(f"{path}: the replay is an animated GIF. Choose a name that ends in .gif.")
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"{path}: the replay is a moving picture. Choose a name that ends in {', '.join(SUFFIXES)}.")
     check_fits(case, result)
     scene = prepare_scene(case)
     frames = list(frames_of(result, scene))
-    pictures = [_indexed(picture) for picture in draw_frames(case, scene, frames, _verdict(result.verdict))]
+    pictures = draw_frames(case, scene, frames, _verdict(result.verdict))
+    durations = [frame.milliseconds for frame in frames]
+    write = _write_gif if suffix == ".gif" else write_film
     with temporary_file(path) as part:
-        pictures[0].save(
-            part,
-            save_all=True,
-            append_images=pictures[1:],
-            duration=[frame.milliseconds for frame in frames],
-            loop=0,
-        )
+        write(part, pictures, durations)
+
+
+def _write_gif(path: Path, pictures: Iterator[Picture], durations: list[int]) -> None:
+    first, *others = [_indexed(picture) for picture in pictures]
+    first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
+
+
+def write_film(path: Path, pictures: Iterator[Picture], durations: list[int]) -> None:
+    """Write pictures (H, W, 3), each shown for so many milliseconds, as a film in the format of the path's suffix."""
+    import imageio_ffmpeg
+
+    codec, *options = _CODECS[path.suffix.lower()]
+    writer = None
+    for picture, milliseconds in zip(pictures, durations, strict=True):
+        rows, columns, _ = picture.shape
+        even = np.pad(picture, ((0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")  # as the codecs need it
+        if writer is None:
+            writer = imageio_ffmpeg.write_frames(
+                str(path),
+                (even.shape[1], even.shape[0]),
+                pix_fmt_in="bgr24",
+                fps=_FPS,
+                codec=codec,
+                output_params=options,
+                macro_block_size=2,
+                ffmpeg_log_level="error",
+            )
+            writer.send(None)
+        for _ in range(max(1, round(milliseconds * _FPS / 1000))):
+            writer.send(np.ascontiguousarray(even))
+    if writer is not None:
+        writer.close()
 
 
 def frames_of(result: Result, scene: Scene) -> Iterator[Frame]:
@@ -105,7 +140,7 @@ def _detail(evaluations: int, cost: float) -> str:
 
 def _verdict(verdict: Verdict) -> tuple[str, tuple[int, int, int]]:
     """What the last line says, and its colour."""
-    return ("trusted: every check passed", GREEN) if verdict.trusted else ("NOT TRUSTED: see the report", RED)
+    return ("trusted: every check passed", _GOOD) if verdict.trusted else ("NOT TRUSTED: see the report", _BAD)
 
 
 def draw_frames(
@@ -154,6 +189,7 @@ class _Renderer:
 
     def __init__(self, scene: Scene, camera: Camera) -> None:
         self._scene, self._camera = scene, camera
+        self.colours = object_colours(scene.objects)
         self._last: dict[tuple[str, int], tuple[Camera, Tensor, Tensor]] = {}
 
     def __call__(self, poses: Poses, name: str, view: int) -> Tensor:
@@ -182,7 +218,7 @@ def _panel(
         picture //= 2
         return picture
     for name in edged:
-        picture[edges_of(renderer(frame.poses, name, view))] = GREEN
+        paint_edges(picture, renderer(frame.poses, name, view), renderer.colours[name])
     total = torch.stack([renderer(frame.poses, name, view) for name in drawn]).sum(0)
     text = f"view {view + 1}, similarity {1 - float(similarity(total[None])[0]):.3f}"
     picture[-_BAR_PX:] //= 3
@@ -199,11 +235,15 @@ def _bar(width: int, left: tuple[str, tuple[int, int, int]], right: tuple[str, t
 
 
 def _palette() -> NDArray[np.uint8]:
-    """Colours (256, 3) of all frames, RGB: greys, and ramps to green and red. The same for all, so nothing flickers."""
+    """Colours (256, 3) of all frames, RGB: greys, and a ramp to each colour. The same for all, so nothing flickers."""
+    ramps: tuple[Colour, ...] = (*OBJECT_COLOURS, (_BAD[2], _BAD[1], _BAD[0]))
+    steps = 16
+    greys = 256 - steps * len(ramps)
     colours = np.zeros((256, 3), np.uint8)
-    colours[:192] = np.linspace(0, 255, 192)[:, None]
-    colours[192:224, 1] = np.linspace(8, 255, 32)
-    colours[224:] = np.linspace(0.03, 1, 32)[:, None] * np.array(RED[::-1])
+    colours[:greys] = np.linspace(0, 255, greys)[:, None]
+    for number, ramp in enumerate(ramps):
+        first = greys + number * steps
+        colours[first : first + steps] = np.linspace(0.2, 1, steps)[:, None] * np.array(ramp)
     return colours
 
 

@@ -8,8 +8,9 @@ import cv2
 from femoreg_torch.case import Case, Result, new_folder
 from femoreg_torch.evaluation.errors import errors, reference_points
 from femoreg_torch.evaluation.fit import check_fits
-from femoreg_torch.evaluation.overlay import overlay_figure
+from femoreg_torch.evaluation.overlay import draw, overlay_figure
 from femoreg_torch.evaluation.report import report_page
+from femoreg_torch.evaluation.report.pictures import PANEL_PX
 from femoreg_torch.files import write_json, write_text
 from femoreg_torch.registration import Scene, prepare_scene
 
@@ -34,8 +35,9 @@ def write_report(case: Case, result: Result, run: Path) -> dict[str, Any] | None
     check_fits(case, result)
     scene = prepare_scene(case)
     found = evaluate(case, result, scene)
-    overlay = overlay_figure(case, scene, result.poses)
-    page = report_page(case, result, found, overlay)
+    drawn = draw(scene, result.poses, PANEL_PX)
+    overlay = overlay_figure(case, scene, result.poses, drawn)
+    page = report_page(case, scene, result, found, drawn)
     with new_folder(run, without=EVALUATION_NAMES) as folder:
         if found is not None:
             write_json(folder / ERRORS_NAME, found)
@@ -43,3 +45,11 @@ def write_report(case: Case, result: Result, run: Path) -> dict[str, Any] | None
             raise OSError(f"{run / OVERLAY_NAME}: the picture could not be written.")
         write_text(folder / REPORT_NAME, page)
     return found
+
+
+def evaluation_page(case: Case, result: Result) -> str:
+    """The report alone, as text. Raises `InputError` if the result does not fit the case."""
+    check_fits(case, result)
+    scene = prepare_scene(case)
+    found = evaluate(case, result, scene)
+    return report_page(case, scene, result, found, draw(scene, result.poses, PANEL_PX))

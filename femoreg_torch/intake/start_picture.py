@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.case import Case, StartRecord
-from femoreg_torch.evaluation.overlay import GREEN, draw_edges, monitor_picture, small_field
+from femoreg_torch.drr import project
+from femoreg_torch.evaluation.colours import object_colours
+from femoreg_torch.evaluation.overlay import monitor_picture, paint_edges, small_field
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
 from femoreg_torch.intake.planes import Picture
@@ -59,9 +61,12 @@ def _panel(case: Case, scene: Scene, poses: Poses, kind: str) -> Picture:
     camera = scene.carm.camera.downsampled(factor)
     panel = monitor_picture(downsample(scene.image(kind, 0), factor), small_field(scene, kind, 0, factor))
     names = scene.shown(poses.camera1_from, kind)
-    draw_edges(panel, [(scene.objects[name].volume, poses.camera_from(name)[0]) for name in names], camera)
+    colours = object_colours(scene.objects)
     for name in names:
-        _write(panel, camera, poses.camera_from(name)[0], scene.objects[name].reference_point, name, GREEN)
+        pose = poses.camera_from(name)[0]
+        drawn = project([scene.objects[name].volume], pose[None, None], camera)[0]
+        paint_edges(panel, drawn, colours[name])
+        _write(panel, camera, pose, scene.objects[name].reference_point, name, colours[name][::-1])
     if scene.anchor in poses.camera1_from:
         camera_from_ct = poses.camera_from(scene.anchor)[0]
         for mark, point in case.landmarks.items():

@@ -6,6 +6,7 @@ handle stands off in +x. Nothing about it is symmetric, so that its pose can be 
 
 from dataclasses import dataclass
 
+import manifold3d  # noqa: F401  # engine of trimesh.boolean: where it is missing, this says so at once
 import numpy as np
 import torch
 import trimesh

@@ -6,9 +6,11 @@ import cv2
 import numpy as np
 import torch
 
+from femoreg_torch.evaluation.overlay import Picture, monitor_picture
+from femoreg_torch.fluoro import attenuation_image, downsample
 from sim.theatre.images import ViewImages
 
-_PREVIEW_PX = 512
+_PREVIEW_PX = 512  # width of one image, or a little more: the detector is averaged over whole blocks
 
 
 def write_preview(path: Path, images: list[ViewImages]) -> None:
@@ -18,9 +20,5 @@ def write_preview(path: Path, images: list[ViewImages]) -> None:
         raise OSError(f"{path}: the preview could not be written.")
 
 
-def _shown(raw: torch.Tensor) -> np.ndarray:
-    """An 8-bit picture of a raw image (H, W): small, logarithmic, windowed to what lies behind the patient."""
-    small = cv2.resize(raw.numpy(), (_PREVIEW_PX, _PREVIEW_PX), interpolation=cv2.INTER_AREA).astype(np.float32)
-    grey = np.log(small.clip(1))
-    low, high = np.percentile(grey[grey < grey.max() - 2], [0.5, 95])
-    return ((grey - low) / max(high - low, 1e-6) * 255).clip(0, 255).astype(np.uint8)
+def _shown(raw: torch.Tensor) -> Picture:
+    return monitor_picture(downsample(attenuation_image(raw.float()), max(1, raw.shape[1] // _PREVIEW_PX)))

@@ -34,6 +34,16 @@ def pose() -> torch.Tensor:
 @pytest.fixture
 def procedure(tmp_path: Path) -> tuple[Path, Path]:
     """A case folder with one pelvis block, one femur block, a device box and three noisy images; and a perfect run."""
+    return make_procedure(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def kept_procedure(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The same for all tests of a module, which leave its files as they are."""
+    return make_procedure(tmp_path_factory.mktemp("procedure"))
+
+
+def make_procedure(tmp_path: Path) -> tuple[Path, Path]:
     folder = tmp_path / "case"
     folder.mkdir()
     labels = torch.zeros(30, 30, 40, dtype=torch.uint8)

@@ -2,10 +2,12 @@
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,7 +16,7 @@ from PIL import Image
 
 from femoreg_torch.case import read_case, read_result, write_json
 from femoreg_torch.commands.main import main
-from femoreg_torch.evaluation.replay import frames_of
+from femoreg_torch.evaluation.replay import frames_of, write_film
 from femoreg_torch.geometry import centred_camera, project_points, rigid, transform_points
 from femoreg_torch.registration import prepare_scene
 
@@ -76,11 +78,14 @@ def pictures(path: Path) -> list[NDArray[np.uint8]]:
     return found
 
 
-def green(picture: NDArray[np.uint8], row: int, view: int) -> NDArray[np.bool_]:
-    """Pixels of an edge in one panel: row 0 is anatomy, 1 device."""
+COLOURS = ((86, 180, 233), (0, 158, 115))  # Okabe and Ito's sky blue and bluish green: first object, third object
+
+
+def edges(picture: NDArray[np.uint8], row: int, view: int) -> NDArray[np.bool_]:
+    """Pixels of an edge in one panel: row 0 is anatomy, with the pelvis, 1 device."""
     rows, columns = CAMERA.shape
     panel = picture[22 + row * rows :, view * columns :][:rows, :columns].astype(int)
-    return (panel[..., 1] > 200) & (panel[..., 0] < 60) & (panel[..., 2] < 60)
+    return np.abs(panel - COLOURS[row]).max(-1) < 12
 
 
 def test_frames_follow_the_trace(run: Path) -> None:
@@ -104,18 +109,18 @@ def test_edges_stand_where_the_pelvis_was_and_in_views_that_have_their_place(run
     film = pictures(run / "replay.gif")
     bar, (rows, columns) = 22, CAMERA.shape
     assert film[0].shape == (2 * rows + 2 * bar, 3 * columns, 3)
-    start = green(film[0], 0, 0)[: rows - bar]  # the last rows hold text
+    start = edges(film[0], 0, 0)[: rows - bar]  # the last rows hold text
     corner = torch.tensor([[-45.0, 0, 0]], dtype=torch.float64)  # the face of the pelvis block towards the right
     for frame, shift in ((film[0], SHIFTS[0]), (film[-1], SHIFTS[-1])):
         left = project_points(CAMERA, transform_points(shifted(shift), corner))[0, 0].item()
-        found = np.nonzero(green(frame, 0, 0)[: rows - bar].any(0))[0].min()
+        found = np.nonzero(edges(frame, 0, 0)[: rows - bar].any(0))[0].min()
         assert abs(found - left) < 2 or (left < 0 and found < 2)
     assert start.any()
-    assert not green(film[0], 0, 1).any()  # view 2 has no place yet
-    assert green(film[-1], 0, 1).any()
-    assert not green(film[-1], 0, 2).any()  # and view 3 never gets one here
-    assert not green(film[0], 1, 0).any()
-    assert green(film[-1], 1, 0).any()
+    assert not edges(film[0], 0, 1).any()  # view 2 has no place yet
+    assert edges(film[-1], 0, 1).any()
+    assert not edges(film[-1], 0, 2).any()  # and view 3 never gets one here
+    assert not edges(film[0], 1, 0).any()
+    assert edges(film[-1], 1, 0).any()
 
 
 def test_the_end_says_that_the_result_is_not_trusted(run: Path) -> None:
@@ -149,7 +154,7 @@ def case_moved(run: Path) -> None:
         (without_moments, [], "Register again"),
         (two_views, [], "2 views, but"),
         (case_moved, [], "Name the case folder with --case"),
-        (lambda run: None, ["--out", "replay.mp4"], "ends in .gif"),
+        (lambda run: None, ["--out", "replay.avi"], "ends in .gif, .mp4, .webm"),
     ],
 )
 def test_what_cannot_be_replayed_is_one_line(
@@ -167,3 +172,49 @@ def test_a_case_that_was_moved_can_be_named(run: Path) -> None:
     case_moved(run)
     assert main(["replay", str(run), "--case", str(run.parent / "archive")]) == 0
     assert (run / "replay.gif").is_file()
+
+
+def film_frames(path: Path) -> tuple[list[NDArray[np.uint8]], float]:
+    """Frames (H, W, 3), RGB, of a film as OpenCV reads it, and how many it shows in a second."""
+    film = cv2.VideoCapture(str(path))
+    shown = []
+    while (read := film.read())[0]:
+        shown.append(read[1][..., ::-1])
+    rate = film.get(cv2.CAP_PROP_FPS)
+    film.release()
+    return shown, rate
+
+
+def test_a_film_shows_what_the_gif_shows(run: Path) -> None:
+    assert main(["replay", str(run)]) == 0
+    assert main(["replay", str(run), "--out", str(run / "replay.mp4")]) == 0
+    still = pictures(run / "replay.gif")[-1].astype(float)
+    with Image.open(run / "replay.gif") as gif:
+        seconds = 0.0
+        for number in range(gif.n_frames):  # type: ignore[attr-defined]
+            gif.seek(number)
+            seconds += gif.info["duration"] / 1000
+    shown, rate = film_frames(run / "replay.mp4")
+    assert len(shown) / rate == pytest.approx(seconds, abs=0.5)
+    assert shown[-1].shape == still.shape
+    assert np.abs(shown[-1] - still).mean() < 12
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".webm"])
+def test_a_film_shows_every_picture_for_as_long_as_it_is_told(suffix: str, tmp_path: Path) -> None:
+    """Black for 0.4 s, then white for 0.8 s, of an odd number of pixels."""
+    black = np.zeros((63, 95, 3), np.uint8)
+    write_film(tmp_path / f"film{suffix}", iter([black, black + 255]), [400, 800])
+    shown, rate = film_frames(tmp_path / f"film{suffix}")
+    bright = [bool(picture.mean() > 128) for picture in shown]
+    assert bright == sorted(bright)
+    assert bright.count(False) / rate == pytest.approx(0.4, abs=0.05)
+    assert bright.count(True) / rate == pytest.approx(0.8, abs=0.05)
+    assert shown[0].shape == (64, 96, 3)
+
+
+def test_a_film_needs_the_extra(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert main(["replay", str(run), "--out", str(run / "replay.mp4")]) == 2
+    assert "femoreg-torch[video]" in capsys.readouterr().err
+    assert not (run / "replay.mp4").exists()

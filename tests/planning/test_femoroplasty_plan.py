@@ -16,7 +16,8 @@ from scipy import ndimage
 from femoreg_torch.case import Case, ObjectQuality, Result, read_case, write_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation.planning_section import planning_section
+from femoreg_torch.evaluation.report.parts import Material, Section
+from femoreg_torch.evaluation.report.planning import planning
 from femoreg_torch.files import write_json
 from femoreg_torch.geometry import Poses
 from femoreg_torch.planning.distribution import mechanism
@@ -321,17 +322,21 @@ def test_the_report_tells_the_plan(written: File, folder: File, plan: Femoroplas
     pose = torch.eye(4, dtype=torch.float64)
     covariance = torch.diag(torch.tensor([0.04, 0.04, 0.04, 0.01, 0.01, 0.01], dtype=torch.float64))
     result = Result(Poses(pose[None], {"femur": pose}), {"femur": good}, path_covariance=covariance)
-    assert planning_section(case, result) == ""  # its path is no plan's
+    assert planning(Material(case, None, result, None, None)) is None  # its path is no plan's
     file = folder / "with_response.json"
     content = json.loads((written / "plan.json").read_text())
     sloped = Response(100 * plan.gain, np.array([5.0, 0, 0, 0, 0]), np.zeros(5), 4.0, plan.path.entry, plan.path.target)
     write_json(file, content | {"response": response_content(sloped)})
-    page = planning_section(dataclasses.replace(case, plan=dataclasses.replace(case.plan, file=file)), result)
-    assert "the modelled gain is" in page
-    assert "± 1.0 %" in page  # 5 % per mm, 0.2 mm
-    assert f"<td>{plan.curve.yield_load_n:.0f}</td>" in page
-    assert page.count("<tr>") == 2 + 3 + len(plan.path.ellipsoids)
-    assert "research software" in page.lower()
+    case = dataclasses.replace(case, plan=dataclasses.replace(case.plan, file=file))
+    section = planning(Material(case, None, result, None, None))
+    assert isinstance(section, Section)
+    assert "the modelled gain is" in section.paragraphs[0]
+    assert "± 1.0 %" in section.paragraphs[0]  # 5 % per mm, 0.2 mm
+    assert "research software" in section.paragraphs[-1].lower()
+    loads, injections = section.tables
+    assert [row[0] for row in loads.rows] == ["baseline", "planned", "optimum"]
+    assert loads.rows[1][1] == f"{plan.curve.yield_load_n:.0f}"
+    assert len(injections.rows) == len(plan.path.ellipsoids)
 
 
 def plan_head() -> torch.Tensor:

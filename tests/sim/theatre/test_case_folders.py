@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -50,7 +51,15 @@ def test_a_simulated_case_is_complete(simulated):
     assert len(case.views) == 3
     assert case.truth.camera_from("pelvis").shape == (3, 4, 4)
     assert set(case.truth.camera1_from) == {"pelvis", "femur", "device"}
-    assert (simulated / "preview.png").is_file()
+    preview = cv2.imread(str(simulated / "preview.png"), cv2.IMREAD_GRAYSCALE)
+    assert preview is not None
+    rows, columns = case.carm.camera.shape
+    assert preview.shape == (2 * rows, 3 * columns)
+    for view in range(3):  # neither black nor white in the middle, where the hip is
+        middle = preview[rows // 4 : 3 * rows // 4, view * columns : (view + 1) * columns][
+            :, columns // 4 : -columns // 4
+        ]
+        assert 40 < np.median(middle) < 215
     for view in case.views:
         anatomy, device = read_image(view.images["anatomy"]), read_image(view.images["device"])
         assert anatomy.shape == case.carm.camera.shape

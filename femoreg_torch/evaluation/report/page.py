@@ -1,0 +1,68 @@
+"""The report of one registration: a single HTML file that needs nothing beside it and loads nothing."""
+
+import base64
+import hashlib
+from functools import cache
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from femoreg_torch.case import Case, Result
+from femoreg_torch.evaluation.overlay import Drawn
+from femoreg_torch.evaluation.report.card import card
+from femoreg_torch.evaluation.report.parts import Material
+from femoreg_torch.evaluation.report.sections import SECTIONS
+from femoreg_torch.navigation.report import NOTICE
+from femoreg_torch.registration import Scene
+
+_SCRIPTS = ("images.js", "theatre.js")
+
+
+def report_page(case: Case, scene: Scene, result: Result, errors: dict[str, Any] | None, drawn: Drawn) -> str:
+    """The report of a registration as the text of one HTML file.
+
+    `errors` are those against the truth, None if there is none; `drawn` is the scene at the result's poses. Whatever
+    comes from files is escaped, and the page's policy lets the browser run its own scripts only and load nothing.
+    """
+    environment = _environment()
+    material = Material(case, scene, result, errors, drawn)
+    made = (make(material) for make in SECTIONS)
+    scripts = [Markup(_source(name)) for name in _SCRIPTS]
+    return environment.get_template("report.html").render(
+        title=case.folder.resolve().name,
+        side=case.side,
+        views=len(case.views),
+        simulated=case.truth is not None and case.anchor in case.truth.camera1_from,
+        notice=NOTICE,
+        card=card(case, result, {name: thing.reference_point for name, thing in scene.objects.items()}),
+        sections=[section for section in made if section is not None],
+        style=Markup(_source("report.css")),
+        scripts=scripts,
+        policy=_policy(scripts),
+    )
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("femoreg_torch.evaluation.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def _source(name: str) -> str:
+    """The text of a file in the folder of the templates, as it stands there."""
+    loader, environment = _environment().loader, _environment()
+    assert loader is not None
+    return loader.get_source(environment, name)[0]
+
+
+def _policy(scripts: list[Markup]) -> str:
+    """The Content-Security-Policy: these scripts by their hashes, pictures within the page, and nothing else."""
+    digests = (hashlib.sha256(script.encode()).digest() for script in scripts)
+    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
+    return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {hashes}"
