@@ -91,7 +91,7 @@ def _jobs(cases: Sequence[Path], out: Path, preset: str, seed: int, weights: Pat
     """What is to be done. Raises `InputError` for cases that would be written to one place, and for no jobs."""
     import os
 
-    from femoreg_torch.errors import InputError
+    from femoreg_torch.errors import InputError, shortened
     from femoreg_torch.registration import load_plan
 
     if count < 1:
@@ -101,7 +101,7 @@ def _jobs(cases: Sequence[Path], out: Path, preset: str, seed: int, weights: Pat
     for name in names:
         if names.count(name) > 1:
             raise InputError(
-                f"{names.count(name)} cases are called {name!r}: their runs would be one folder. Rename them."
+                f"{names.count(name)} cases are called {shortened(name)}: their runs would be one folder. Rename them."
             )
     threads = max(1, len(os.sched_getaffinity(0)) // count)
     return [Job(case, out / name, preset, seed, weights, threads) for case, name in zip(cases, names, strict=True)]

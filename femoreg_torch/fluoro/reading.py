@@ -8,20 +8,30 @@ import SimpleITK as sitk
 import torch
 from torch import Tensor
 
+from femoreg_torch.arrays import MOST_PIXELS, check_pixels, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera
+from femoreg_torch.text import read_bytes
 from femoreg_torch.volume.itk import read_itk
 
 _ITK_SUFFIXES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
+_MOST_PICTURE_BYTES = 2**28  # what the most pixels have as floats
 
 
 def _read_picture(path: Path) -> np.ndarray:
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+    content = np.frombuffer(read_bytes(path, _MOST_PICTURE_BYTES), np.uint8)
+    try:
+        with quiet():
+            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+    except (cv2.error, MemoryError):  # what OpenCV does with more pixels than it was told to allow
+        image = None
     if image is None:
-        raise InputError(f"{path}: cannot be read as a PNG or TIFF image; the file is damaged or something else.")
+        raise InputError(
+            f"{path}: cannot be read as a PNG or TIFF image of at most {MOST_PIXELS} pixels; the file is damaged or "
+            "something else."
+        )
     return image
 
 
@@ -36,22 +46,26 @@ def _read_dicom(path: Path) -> np.ndarray:
     from pydicom.pixels import apply_rescale
 
     try:
-        dataset = pydicom.dcmread(path)
+        with quiet():
+            dataset = pydicom.dcmread(path)
+            frames = int(dataset.get("NumberOfFrames") or 1)
+            if frames > 1:
+                raise InputError(f"{path}: holds {frames} frames, one was expected. Export the frame to be registered.")
+            check_pixels(path, int(dataset.Rows), int(dataset.Columns))
+            pixels = dataset.pixel_array
+            if dataset.PhotometricInterpretation == "MONOCHROME1":  # low values are shown bright
+                lowest = -(2 ** (dataset.BitsStored - 1)) if dataset.PixelRepresentation else 0
+                pixels = 2 * lowest + 2**dataset.BitsStored - 1 - pixels.astype(np.int64)
+            return apply_rescale(pixels, dataset)
     except InvalidDicomError as error:
         raise InputError(
             f"{path}: not a DICOM file, and its name does not end in {', '.join(_PICTURE_SUFFIXES + _ITK_SUFFIXES)}."
         ) from error
-    frames = int(dataset.get("NumberOfFrames") or 1)
-    if frames > 1:
-        raise InputError(f"{path}: holds {frames} frames, one was expected. Export the frame to be registered.")
-    try:
-        pixels = dataset.pixel_array
-    except (AttributeError, KeyError, NotImplementedError, RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: the DICOM file holds no image that can be decoded ({error}).") from error
-    if dataset.PhotometricInterpretation == "MONOCHROME1":  # low values are shown bright
-        lowest = -(2 ** (dataset.BitsStored - 1)) if dataset.PixelRepresentation else 0
-        pixels = 2 * lowest + 2**dataset.BitsStored - 1 - pixels.astype(np.int64)
-    return apply_rescale(pixels, dataset)
+    except InputError:
+        raise
+    except Exception as error:  # pydicom's readers and decoders raise whatever their parsing runs into
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: the DICOM file holds no image that can be decoded ({reason}).") from error
 
 
 def read_image(path: Path) -> Tensor:
@@ -73,7 +87,9 @@ def read_image(path: Path) -> Tensor:
         array = _read_dicom(path)
     if array.ndim == 3 and array.shape[-1] in (3, 4):
         raise InputError(f"{path}: a colour image, but fluoroscopy has one value per pixel. Export it as greyscale.")
-    if array.ndim != 2:
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{path}: holds {array.dtype} values, but real numbers were expected. Export the image anew.")
+    if array.ndim != 2 or 0 in array.shape:
         raise InputError(f"{path}: one image was expected, found {' × '.join(str(n) for n in array.shape)} values.")
     image = torch.from_numpy(array.astype(np.float32))
     lowest, highest = (v.item() for v in image.aminmax())
@@ -90,7 +106,9 @@ def write_image(path: Path, image: Tensor) -> None:
     if image.dtype != torch.uint16 or image.ndim != 2 or path.suffix.lower() not in _PICTURE_SUFFIXES:
         raise InputError(f"{path}: a (H, W) uint16 image and a name in {', '.join(_PICTURE_SUFFIXES)} were expected.")
     with temporary_file(path) as part:
-        if not cv2.imwrite(str(part), image.numpy()):
+        with quiet():
+            written = cv2.imwrite(str(part), image.numpy())
+        if not written:
             raise OSError(f"{path}: the image could not be written.")
 
 

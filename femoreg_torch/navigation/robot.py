@@ -7,8 +7,10 @@ import SimpleITK as sitk
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.arrays import quiet
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import check_rigid, invert_rigid, rigid
+from femoreg_torch.text import MOST_YAML_BYTES, read_bytes
 
 _LEAST_REACH_MM = 10.0  # no tool stands this close to the base of its robot: the numbers are metres
 
@@ -81,7 +83,7 @@ def _exactly_rigid(pose: Tensor) -> Tensor:
 
 def _read_text(path: Path, names: _Names) -> dict[str, Tensor]:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_bytes(path, MOST_YAML_BYTES).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not text. Expected: {names.format}.") from error
     name = path.stem
@@ -106,15 +108,18 @@ def _row(words: list[str], where: str) -> list[float]:
     except ValueError:
         values = []
     if len(values) != 4:
-        raise InputError(f"{where}: four numbers or the name of a matrix were expected, found {' '.join(words)!r}.")
+        raise InputError(
+            f"{where}: four numbers or the name of a matrix were expected, found {shortened(' '.join(words))}."
+        )
     return values
 
 
 def _read_tfm(path: Path) -> Tensor:
     """`b_from_a` (4, 4) of a file that takes points of b to a."""
     try:
-        transform = sitk.ReadTransform(str(path))
-    except RuntimeError as error:
+        with quiet():
+            transform = sitk.ReadTransform(str(path))
+    except (RuntimeError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split()).rpartition("): ")[2]
         raise InputError(f"{path}: cannot be read as an ITK transform ({reason}).") from error
     if transform.GetDimension() != 3 or not transform.IsLinear():

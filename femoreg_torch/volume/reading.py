@@ -8,11 +8,14 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy.tables import LARGEST_ID
+from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
+from femoreg_torch.geometry.rigid import FARTHEST_MM
 from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.itk import read_itk
 
+_FINEST_MM, _COARSEST_MM = 0.01, 50.0  # voxels: of a micro-CT, and more than those of any clinical scan
 _FAT_HU, _BONE_HU = -50, 200  # every CT of a hip holds something below the first and something above the second
 
 
@@ -27,6 +30,14 @@ def _read(path: Path) -> sitk.Image:
             f"{path}: a 3-D volume of one channel was expected, found {size} voxels of "
             f"{image.GetNumberOfComponentsPerPixel()} channel(s)."
         )
+    spacing = image.GetSpacing()
+    if not (min(spacing) >= _FINEST_MM and max(spacing) <= _COARSEST_MM):
+        told = " × ".join(f"{s:.3g}" for s in spacing)
+        raise InputError(
+            f"{path}: voxels of {told} mm were found, {_FINEST_MM:g} to {_COARSEST_MM:g} mm expected. Is it in mm?"
+        )
+    if max(map(abs, image.GetOrigin())) > FARTHEST_MM:
+        raise InputError(f"{path}: its origin lies {max(map(abs, image.GetOrigin())):.3g} mm away. Export it anew.")
     if np.linalg.det(np.reshape(image.GetDirection(), (3, 3))) < 0:
         raise InputError(
             f"{path}: the direction matrix is mirrored (left-handed, determinant −1), so left and right cannot be told "
@@ -109,7 +120,10 @@ def read_labels(path: Path, like: Volume) -> Volume:
 
 
 def write_volume(path: Path, volume: Volume) -> None:
-    """Write a volume; the suffix chooses the format (.nii.gz, .nrrd, .mha). HU (float) are stored as whole numbers."""
+    """Write a volume; the suffix chooses the format (.nii.gz, .nrrd, .mha). HU (float) are stored as whole numbers.
+
+    Raises `OSError` that names the file if it cannot be written.
+    """
     data = volume.data.numpy()
     if data.dtype.kind == "f":
         data = np.clip(np.rint(data), -32768, 32767).astype(np.int16)
@@ -119,4 +133,9 @@ def write_volume(path: Path, volume: Volume) -> None:
     image.SetDirection((volume.lps_from_index[:3, :3].numpy() / spacing).ravel().tolist())
     image.SetOrigin(volume.lps_from_index[:3, 3].tolist())
     with temporary_file(Path(path)) as part:
-        sitk.WriteImage(image, str(part), useCompression=True)
+        try:
+            with quiet():
+                sitk.WriteImage(image, str(part), useCompression=True)
+        except RuntimeError as error:
+            reason = (str(error).strip().splitlines() or ["unknown reason"])[-1][:200]
+            raise OSError(f"{path}: cannot be written ({reason}).") from error

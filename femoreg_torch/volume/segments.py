@@ -9,7 +9,8 @@ from pathlib import Path
 
 import SimpleITK as sitk
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.arrays import quiet
+from femoreg_torch.errors import InputError, shortened
 
 _NAME = re.compile(r"Segment(\d+)_Name")
 
@@ -24,12 +25,12 @@ def segment_names(path: Path) -> dict[str, tuple[int, ...]]:
         raise InputError(f"{path}: no such file.")
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)  # the reason of a failure comes with the exception
     try:
-        reader.ReadImageInformation()
-    except RuntimeError as error:
+        with quiet():
+            reader.ReadImageInformation()
+            fields = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
+    except (RuntimeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read; a segmentation of 3D Slicer (.seg.nrrd) was expected.") from error
-    fields = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
     numbers = sorted(int(match[1]) for match in map(_NAME.fullmatch, fields) if match)
     if not numbers:
         raise InputError(
@@ -54,9 +55,9 @@ def segment_names(path: Path) -> dict[str, tuple[int, ...]]:
 
 def _label_value(fields: dict[str, str], number: int, path: Path) -> int:
     text = fields.get(f"Segment{number}_LabelValue", "")
-    if not text.strip().isdecimal() or int(text) == 0:
+    if not (text.strip().isdecimal() and len(text.strip()) < 10 and int(text) > 0):
         raise InputError(
-            f"{path}, Segment{number}_LabelValue: a whole number above 0 was expected, found {text[:20]!r}. Save it "
-            "anew with 3D Slicer 4.11 or later."
+            f"{path}, Segment{number}_LabelValue: a whole number above 0 was expected, found {shortened(text, 20)}. "
+            "Save it anew with 3D Slicer 4.11 or later."
         )
     return int(text)
