@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test lint notebooks bench bench-gpu accuracy capture-range trust ablation
+.PHONY: setup demo test fuzz audit lint notebooks bench bench-gpu accuracy capture-range trust ablation
 
 setup: .venv/.installed
 
@@ -17,6 +17,15 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest
+
+# ten thousand broken files at all doors, from a new seed; FEMOREG_FUZZ_SEED=… repeats one
+fuzz: setup
+	FEMOREG_FUZZ_COUNT=10000 $(BIN)/python -m pytest -m 'long or not long' tests/fuzz
+
+# known vulnerabilities of what constraints.txt pins; needs a network
+audit: setup
+	$(BIN)/python -m pip install --quiet pip-audit
+	$(BIN)/python -m pip_audit --requirement constraints.txt --no-deps --disable-pip
 
 lint: setup
 	$(BIN)/ruff check .
