@@ -149,6 +149,9 @@ def _workshop(path: Path) -> Iterator[Path]:
             lock = os.open(workshop / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
         except FileNotFoundError:  # another writer took the empty folder for a leftover
             continue
+        except OSError:  # a full disk, say
+            workshop.rmdir()
+            raise
         with suppress(OSError):  # a file system without locks: nobody can lock there, so nothing is ever cleared
             fcntl.flock(lock, fcntl.LOCK_EX)
         if (workshop / _LOCK).exists():

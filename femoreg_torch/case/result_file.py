@@ -325,6 +325,6 @@ def _placed(fields: Fields, otherwise: Poses) -> Poses:
     if "carm_refined" in fields:
         poses = replace(poses, changes=_changes(fields, len(poses.camera_from_camera1)))
     placed = fields.mapping("camera1_from")
-    for name in placed.only(*otherwise.camera1_from).content:
+    for name in placed.content:
         poses = poses.with_object(name, placed.transform(name))
     return poses

@@ -120,7 +120,7 @@ def _read_tfm(path: Path) -> Tensor:
         with quiet():
             transform = sitk.ReadTransform(str(path))
     except (RuntimeError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split()).rpartition("): ")[2]
+        reason = " ".join(str(error).split()).rpartition("): ")[2][:200]
         raise InputError(f"{path}: cannot be read as an ITK transform ({reason}).") from error
     if transform.GetDimension() != 3 or not transform.IsLinear():
         raise InputError(f"{path}: a rigid transform in 3D was expected, found {transform.GetName()}.")

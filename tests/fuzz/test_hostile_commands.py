@@ -16,8 +16,6 @@ from femoreg_torch.commands import main as module
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 
-pytestmark = pytest.mark.long  # random inputs; run by `make fuzz`
-
 SEED = int(os.environ.get("FEMOREG_FUZZ_SEED", time.time_ns() % 2**31))
 COUNT = int(os.environ.get("FEMOREG_FUZZ_COUNT", 600)) // 10
 _OPTIONS = (

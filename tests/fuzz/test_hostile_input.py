@@ -22,8 +22,6 @@ from fuzz_mutators import mutated_bytes, mutated_text
 
 from femoreg_torch.errors import InputError
 
-pytestmark = pytest.mark.long  # random inputs; run by `make fuzz`
-
 SEED = int(os.environ.get("FEMOREG_FUZZ_SEED", time.time_ns() % 2**31))
 COUNT = int(os.environ.get("FEMOREG_FUZZ_COUNT", 600))
 LONGEST_S = 10.0
