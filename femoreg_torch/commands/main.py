@@ -149,7 +149,7 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
         parser.add_argument(*flags, **settings, help=help_of.get(parameter.name))
     try:
         values = parser.instantiate(parser.parse_args(arguments))
-    except (ArgumentError, TypeError, ValueError) as error:
+    except (ArgumentError, TypeError, ValueError, OSError) as error:  # OSError: a file of options that cannot be read
         raise InputError(f"{name}: {told(error).rstrip('. ')}. See `femoreg {name} --help`.") from error
     for key, (low, high) in _RANGES.items():
         if isinstance(value := values.get(key), int | float) and not low <= value <= high:
