@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test lint notebooks bench bench-gpu accuracy capture-range trust ablation plans
+.PHONY: setup demo test fuzz audit lint notebooks bench bench-gpu accuracy capture-range trust ablation plans
 
 setup: .venv/.installed
 
@@ -18,6 +18,15 @@ demo: setup
 # several processes, each with its share of the cores; the tests of one file run in one of them
 test: setup
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+# ten thousand broken files at all doors, from a new seed; FEMOREG_FUZZ_SEED=… repeats one
+fuzz: setup
+	FEMOREG_FUZZ_COUNT=10000 $(BIN)/python -m pytest tests/fuzz
+
+# known vulnerabilities of what constraints.txt pins; needs a network
+audit: setup
+	$(BIN)/python -m pip install --quiet pip-audit
+	$(BIN)/python -m pip_audit --requirement constraints.txt --no-deps --disable-pip
 
 lint: setup
 	$(BIN)/ruff check .

@@ -4,9 +4,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.text import MOST_YAML_BYTES, read_bytes, yaml_mapping
 
 _SUFFIXES = (".yaml", ".yml")
 
@@ -34,20 +33,17 @@ def _load(group: str, name: str, folder: Path, before: tuple[str, ...]) -> dict[
         if not path.is_file():
             raise InputError(f"{path}: no such file. Give a YAML file or a preset: {', '.join(preset_names(group))}.")
         where, folder = str(path), path.parent
-        text = path.read_bytes()
+        text = read_bytes(path, MOST_YAML_BYTES)
     elif name in (known := preset_names(group)):
         where = f"{group} preset {name}"
         text = files(__name__).joinpath(group, f"{name}.yaml").read_bytes()
     else:
-        raise InputError(f"no {group} preset {name!r}; there are: {', '.join(known)}. A file needs the suffix .yaml.")
+        raise InputError(
+            f"no {group} preset {shortened(name)}; there are: {', '.join(known)}. A file needs the suffix .yaml."
+        )
     if where in before:
         raise InputError(f"{where}: extends itself ({' → '.join((*before, where))}).")
-    try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"{where}: cannot be read as YAML ({' '.join(str(error).split())}).") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{where}: a YAML mapping of keys and values was expected, found {type(content).__name__}.")
+    content = yaml_mapping(text, where)
     if (base := content.pop("extends", None)) is None:
         return content
     if not isinstance(base, str):
@@ -89,7 +85,9 @@ def _merged(base: list[dict[str, Any]], changes: list[dict[str, Any]], where: st
         remove = entry.pop("remove", False)
         for name in [other for _, other in beside] + ([entry["name"]] if remove else []):
             if name not in names:
-                raise InputError(f"{where}: there is no entry named {name!r}; there are: {', '.join(names)}.")
+                raise InputError(
+                    f"{where}: there is no entry named {shortened(name)}; there are: {', '.join(map(str, names))}."
+                )
         if entry["name"] in names:
             place = names.index(entry["name"])
             old = entries.pop(place)

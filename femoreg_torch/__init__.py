@@ -11,6 +11,9 @@ __version__ = "0.1.0"
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
+# OpenCV asks for this once, when it is imported, and then allocates no image that claims to be larger than a detector.
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))
+
 if TYPE_CHECKING:
     from femoreg_torch.anatomy import Anatomy as Anatomy
     from femoreg_torch.anatomy import label_table as label_table

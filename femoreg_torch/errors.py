@@ -2,6 +2,9 @@
 
 import traceback
 from pathlib import Path
+from typing import Any
+
+_FEW = 4
 
 
 class InputError(ValueError):
@@ -17,3 +20,22 @@ def defect_in_one_line(error: Exception) -> str:
     place = traceback.extract_tb(error.__traceback__)[-1]
     told = f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno})"
     return " ".join(told.split())
+
+
+def shortened(value: Any, most: int = 60) -> str:
+    """What was found, in at most so many characters, for a message: text in quotes, the beginning of what is long.
+
+    A mapping, or a list of more than a few plain values, is told by its kind and size alone: one of aliases may be
+    endless when it is written out.
+    """
+    if isinstance(value, list | tuple) and len(value) <= _FEW and not any(isinstance(v, dict | list) for v in value):
+        value = f"[{', '.join(shortened(v, most // _FEW) for v in value)}]"
+        return value if len(value) <= most else f"{value[: most - 1]}…"
+    if isinstance(value, dict | list | tuple | set):
+        return f"a {type(value).__name__} of {len(value)}"
+    if isinstance(value, str):
+        value = value[: 4 * most]
+        text = repr(value)
+    else:
+        text = " ".join(str(value).split())
+    return text if len(text) <= most else text[: most - 1] + "…"

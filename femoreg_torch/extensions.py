@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from importlib.metadata import entry_points
 from typing import Any, Literal
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.settings import read_record
 
 Group = Literal[
@@ -37,19 +37,21 @@ def find(group: Group, kind: str, builtin: Mapping[str, Any], where: str) -> Any
     if kind not in others:
         known = ", ".join([*builtin, *sorted(others.keys() - builtin.keys())])
         raise InputError(
-            f"{where}: unknown kind {str(kind)[:60]!r}. Known kinds: {known}. Others are added by the entry-point "
+            f"{where}: unknown kind {shortened(kind)}. Known kinds: {known}. Others are added by the entry-point "
             f"group {group}."
         )
     try:
         return others[kind].load()
     except (ImportError, AttributeError) as error:
-        raise InputError(f"{where}: kind {kind!r}, {others[kind].value}, cannot be imported ({error}).") from error
+        raise InputError(
+            f"{where}: kind {shortened(kind)}, {others[kind].value}, cannot be imported ({error})."
+        ) from error
 
 
 def pop_kind(content: Any, where: str) -> tuple[str, dict[str, Any]]:
     """The `kind` of a mapping, and all its other keys. Raises `InputError` that starts with `where` if it has none."""
     if not isinstance(content, dict) or not isinstance(content.get("kind"), str):
-        raise InputError(f"{where}: a mapping with the key `kind` was expected, found {str(content)[:60]}.")
+        raise InputError(f"{where}: a mapping with the key `kind` was expected, found {shortened(content)}.")
     return content["kind"], {key: value for key, value in content.items() if key != "kind"}
 
 
@@ -65,5 +67,5 @@ def read_kind(group: Group, builtin: Mapping[str, Any], content: Any, where: str
 def record_of(found: Any, where: str) -> Any:
     """The same class. Raises `InputError` that starts with `where` if it is no dataclass."""
     if not (isinstance(found, type) and dataclasses.is_dataclass(found)):
-        raise InputError(f"{where}: {found!r} was expected to be a dataclass of settings.")
+        raise InputError(f"{where}: {shortened(found)} was expected to be a dataclass of settings.")
     return found

@@ -4,6 +4,7 @@ import csv
 import errno
 import fcntl
 import glob
+import io
 import json
 import math
 import os
@@ -15,8 +16,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.exchange import exchange
+from femoreg_torch.text import MOST_JSON_BYTES, json_content, read_bytes
 
 _RANDOM_PART = "????????"  # of a name by tempfile.mkdtemp
 _SUFFIX = ".part"
@@ -53,11 +55,7 @@ def new_folder(path: Path, without: Collection[str] = ()) -> Iterator[Path]:
 
     Raises `InputError` if `path` is a file, or cannot be renamed because it is a mount point.
     """
-    path = path.resolve()  # so that the name and the parent of `.` and `out/..` are real ones
-    if path.exists() and not path.is_dir():
-        raise InputError(f"{path}: is a file, a folder was expected. Choose another name for the output.")
-    if path.is_mount():
-        raise InputError(f"{path}: is a mount point, which cannot be replaced as a whole. Choose a folder inside it.")
+    path = check_new_folder(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _workshop(path) as workshop:
         built = workshop / _NEW / path.name
@@ -66,6 +64,26 @@ def new_folder(path: Path, without: Collection[str] = ()) -> Iterator[Path]:
         if path.exists():
             _keep_others(path, built, without)
         _put_in_place(built, path, workshop / _OLD)
+
+
+def check_new_folder(path: Path) -> Path:
+    """The real path of a folder that `new_folder` can write; for commands that compute long before they write.
+
+    Raises `InputError` as `new_folder` does, and where nothing may be written.
+    """
+    try:
+        real = path.resolve()  # so that the name and the parent of `.` and `out/..` are real ones
+        there = real.exists()
+    except (OSError, RuntimeError, ValueError) as error:  # a link that leads to itself, or a name that is too long
+        raise InputError(f"{shortened(path, 200)}: cannot be written ({shortened(error, 100)}).") from error
+    if there and not real.is_dir():
+        raise InputError(f"{real}: is a file, a folder was expected. Choose another name for the output.")
+    if there and real.is_mount():
+        raise InputError(f"{real}: is a mount point, which cannot be replaced as a whole. Choose a folder inside it.")
+    above = next(parent for parent in real.parents if parent.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise InputError(f"{real}: cannot be written, {above} is no folder or not yours. Choose another place.")
+    return real
 
 
 def _keep_others(old: Path, built: Path, without: Collection[str]) -> None:
@@ -131,6 +149,9 @@ def _workshop(path: Path) -> Iterator[Path]:
             lock = os.open(workshop / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
         except FileNotFoundError:  # another writer took the empty folder for a leftover
             continue
+        except OSError:  # a full disk, say
+            workshop.rmdir()
+            raise
         with suppress(OSError):  # a file system without locks: nobody can lock there, so nothing is ever cleared
             fcntl.flock(lock, fcntl.LOCK_EX)
         if (workshop / _LOCK).exists():
@@ -193,12 +214,12 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     write_text(path, text + "\n")
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Content of a JSON file that holds an object. Raises `InputError` if it is missing or is something else."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error}).") from error
+def read_json(path: Path, with_nan: bool = False) -> dict[str, Any]:
+    """Content of a JSON file that holds an object. Raises `InputError` if it is missing or is something else.
+
+    NaN and Infinity are refused unless `with_nan`, for files of programs that write them.
+    """
+    content = json_content(read_bytes(path, MOST_JSON_BYTES), str(path), with_nan)
     if not isinstance(content, dict):
         raise InputError(f"{path}: a JSON object {{…}} was expected, found {type(content).__name__}.")
     return content
@@ -207,8 +228,8 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_csv(path: Path, columns: Collection[str]) -> list[dict[str, str]]:
     """The rows of a CSV file by its header, which must hold these columns. Raises `InputError` that names the file."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
+        text = read_bytes(path, MOST_JSON_BYTES).decode("utf-8-sig")
+        rows = list(csv.DictReader(io.StringIO(text, newline="")))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
     if not rows or not set(columns) <= set(rows[0]):

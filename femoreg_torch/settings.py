@@ -1,14 +1,38 @@
 """Settings from YAML into frozen dataclasses, every key and type checked."""
 
+import dataclasses
 import functools
-from collections.abc import Mapping
-from typing import Any, TypeVar
+import json
+from collections.abc import Iterator, Mapping
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from jsonargparse import ArgumentError, ArgumentParser
+from jsonargparse import ArgumentError, ArgumentParser, set_dumper, set_loader
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.text import yaml_content
 
 _T = TypeVar("_T")
+SEEDS = (0, 2**31 - 1)  # that every generator of random numbers takes
+_MODE = "plain"  # of jsonargparse's parsers: text in values and files is read by our one door for YAML
+_LONGEST = 300  # characters of what jsonargparse says of a value, which it quotes as a whole
+
+
+def plain_parser(**settings: Any) -> ArgumentParser:
+    """A parser of jsonargparse that raises `ArgumentError`, and reads YAML as `femoreg_torch.text` does."""
+    set_loader(_MODE, _argument, exceptions=(InputError,))
+    set_dumper(_MODE, json.dumps)
+    return ArgumentParser(exit_on_error=False, parser_mode=_MODE, **settings)
+
+
+def _argument(text: str) -> Any:
+    return yaml_content(text, "value")
+
+
+def told(error: Exception) -> str:
+    """What jsonargparse says of a value, on one line, the middle of what is long left out."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 2 :]}"
 
 
 def read_record(kind: type[_T], content: dict[str, Any], where: str, ready: Mapping[str, Any] | None = None) -> _T:
@@ -18,23 +42,83 @@ def read_record(kind: type[_T], content: dict[str, Any], where: str, ready: Mapp
     with `where` for what is not a mapping, a key that is unknown or missing, and a value of another type or one that
     the record itself refuses.
     """
-    if not isinstance(content, dict):
-        raise InputError(f"{where}: a mapping of keys and values was expected, found {type(content).__name__}.")
-    known = kind.__dataclass_fields__  # type: ignore[attr-defined]
-    for key in content:
-        if key not in known:
-            raise InputError(f"{where}: unknown key {str(key)[:60]!r}. Known keys: {', '.join(known)}.")
+    _check_form(kind, content, where)
     ready = ready or {}
     parser = _parser(kind, frozenset(ready))  # type: ignore[arg-type]  # a class can be hashed
     try:
         return kind(**vars(parser.instantiate(parser.parse_object(content))), **ready)
-    except (ArgumentError, TypeError, InputError) as error:
-        raise InputError(f"{where}: {' '.join(str(error).split())}") from error
+    except (ArgumentError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{where}: {told(error)}") from error
+
+
+def _check_form(hint: Any, value: Any, where: str) -> None:
+    """Raises `InputError` unless mappings with known keys stand where records are expected, and null where it may.
+
+    jsonargparse would take a text in the place of a record for the name of a class, and import its module: code from
+    data. It also takes null for any field.
+    """
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    if value is None:
+        if NoneType not in kinds and Any not in kinds:
+            raise InputError(f"{where}: a value was expected, found null. Leave the key out for its default.")
+        return
+    kinds = tuple(kind for kind in kinds if kind is not NoneType)
+    records = [kind for kind in kinds if dataclasses.is_dataclass(kind)]
+    if records and (isinstance(value, dict) or len(records) == len(kinds)):
+        _check_keys(records[0], value, where)
+    for kind in kinds:
+        items = get_args(kind)
+        if get_origin(kind) in (list, tuple) and isinstance(value, list) and items:
+            for number, item in enumerate(value):
+                of = items[0] if len(items) == 1 or items[1] is Ellipsis else items[min(number, len(items) - 1)]
+                if len(kinds) == 1:
+                    _check_form(of, item, f"{where}[{number}]")
+        elif get_origin(kind) is dict and isinstance(value, dict) and items:
+            for key, item in value.items():
+                _check_form(items[1], item, f"{where}, {shortened(key)}")
+
+
+def _check_keys(record: Any, value: Any, where: str) -> None:
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: a mapping of keys and values was expected, found {shortened(value)}.")
+    hints = get_type_hints(record)
+    for key, item in value.items():
+        if key not in record.__dataclass_fields__:
+            known = ", ".join(record.__dataclass_fields__)
+            raise InputError(f"{where}: unknown key {shortened(key)}. Known keys: {known}.")
+        _check_form(hints[key], item, f"{where}, {key}")
+
+
+def check_within(record: Any, **ranges: tuple[float, float]) -> None:
+    """Raises `InputError` for a field of `record` that lies out of its range (ends included), or is not finite.
+
+    A field may be a number, None, or a list of numbers or of such lists.
+    """
+    for key, (low, high) in ranges.items():
+        for value in _numbers(getattr(record, key)):
+            if not low <= value <= high:
+                raise InputError(f"{key}: {low:g} to {high:g} was expected, found {value:g}.")
+
+
+def check_rising(record: Any, *keys: str) -> None:
+    """Raises `InputError` for a pair of numbers, low and high, whose first is the greater. Other values pass."""
+    for key in keys:
+        value = getattr(record, key)
+        if isinstance(value, list | tuple) and len(value) == 2 and value[0] > value[1]:
+            raise InputError(f"{key}: low and high were expected in this order, found {value[0]:g} and {value[1]:g}.")
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _numbers(item)
+    elif value is not None:
+        yield value
 
 
 @functools.cache
 def _parser(kind: type[Any], without: frozenset[str]) -> ArgumentParser:
     """The parser of a record's fields but for some; made once, as a preset holds many records of one kind."""
-    parser = ArgumentParser(exit_on_error=False)
+    parser = plain_parser()
     parser.add_class_arguments(kind, skip=set(without))
     return parser

@@ -27,6 +27,12 @@ class Grupp2020Settings:
     landmarks: int
     channels: tuple[int, ...] = (32, 64, 128, 256, 512, 1024)  # per level; by default as published
 
+    def __post_init__(self) -> None:
+        if not (1 <= len(self.channels) <= 8 and all(1 <= n <= 2048 for n in self.channels)):
+            raise ValueError(f"channels: 1 to 8 numbers of 1 to 2048 were expected, found {len(self.channels)}.")
+        if not (1 <= self.classes <= 1000 and 1 <= self.landmarks <= 1000):
+            raise ValueError("classes and landmarks: 1 to 1000 were expected.")
+
     def build(self) -> "Grupp2020":
         """A new network with random weights."""
         return Grupp2020(self)

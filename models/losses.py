@@ -16,6 +16,10 @@ class MultiTaskLoss:
     sigma_px: float = 1.5  # of the landmarks' target distributions, in pixels of the heat map (3.1 mm)
     landmark_weight: float = 0.5
 
+    def __post_init__(self) -> None:
+        if not (0.05 <= self.sigma_px <= 50 and 0 <= self.landmark_weight <= 1000):
+            raise ValueError("sigma_px: 0.05 to 50, landmark_weight: 0 to 1000 were expected.")
+
     def __call__(self, prediction: Prediction, labels: Tensor, pixels: Tensor, visible: Tensor) -> dict[str, Tensor]:
         """`segmentation`, `landmarks` and their weighted sum `loss`, in float32 whatever the network's precision.
 

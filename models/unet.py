@@ -28,6 +28,17 @@ class UNetSettings:
     residual: tuple[int, ...] = ()  # residual blocks after those, per level; none by default
     patch: int = 4  # pixels per side that become channels
 
+    def __post_init__(self) -> None:
+        levels = len(self.channels)
+        if not (1 <= levels <= 8 and all(1 <= n <= 2048 for n in self.channels)):
+            raise ValueError(f"channels: 1 to 8 numbers of 1 to 2048 were expected, found {len(self.channels)}.")
+        if len(self.convolutions) != levels or not all(1 <= n <= 32 for n in self.convolutions):
+            raise ValueError(f"convolutions: {levels} numbers of 1 to 32 were expected, as there are channels.")
+        if self.residual and (len(self.residual) != levels or not all(0 <= n <= 32 for n in self.residual)):
+            raise ValueError(f"residual: none, or {levels} numbers of 0 to 32 were expected, as there are channels.")
+        if not (1 <= self.patch <= 64 and 1 <= self.classes <= 1000 and 1 <= self.landmarks <= 1000):
+            raise ValueError("patch: 1 to 64, classes and landmarks: 1 to 1000 were expected.")
+
     def build(self) -> "UNet":
         """A new network with random weights."""
         return UNet(self)

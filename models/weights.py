@@ -34,7 +34,7 @@ class Weights:
 
 
 def save_weights(path: Path, weights: Weights, about: Mapping[str, str]) -> None:
-    """Write weights, and the texts `about` (how they came to be) into the metadata."""
+    """Write weights, and the texts `about` (how they came to be) into the metadata. Raises `OSError`."""
     state = {name: tensor.detach().contiguous() for name, tensor in weights.state.items()}
     metadata = {
         "kind": weights.kind,
@@ -42,7 +42,10 @@ def save_weights(path: Path, weights: Weights, about: Mapping[str, str]) -> None
         "anatomy": weights.anatomy,
         "sigma_px": repr(weights.sigma_px),
     }
-    save_file(state, path, metadata={**about, **metadata})
+    try:
+        save_file(state, path, metadata={**about, **metadata})
+    except SafetensorError as error:
+        raise OSError(f"{path}: cannot be written ({error}).") from error
 
 
 def read_weights(path: Path | None = None) -> Weights:
@@ -59,14 +62,14 @@ def read_weights(path: Path | None = None) -> Weights:
         with safe_open(path, "pt") as content:
             metadata = content.metadata() or {}
             state = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118 (not a dict)
-    except SafetensorError as error:
+    except (SafetensorError, RuntimeError, TypeError) as error:
         raise ValueError(f"{path}: cannot be read as safetensors ({error}).") from error
     try:
         if "kind" not in metadata:
             return _without_kind(json.loads(metadata["config"]), state)
         settings, sigma_px = json.loads(metadata["settings"]), float(metadata["sigma_px"])
         return Weights(metadata["kind"], settings, metadata["anatomy"], sigma_px, state)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(
             f"{path}: its metadata does not say the kind and the settings of a network (at {error}), so these are no "
             "weights that `femoreg train` wrote."

@@ -14,7 +14,7 @@ import torch
 
 from femoreg_torch import files
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import new_folder, read_json, temporary_file, write_json, write_text
+from femoreg_torch.files import check_new_folder, new_folder, read_json, temporary_file, write_json, write_text
 
 
 def names(folder: Path) -> list[str]:
@@ -263,3 +263,19 @@ def test_json_is_readable_and_exact_to_nine_decimals(tmp_path: Path) -> None:
     assert again["names"] == ["FH-l", "a [b] c"]
     assert (again["path"], again["n"], again["nothing"], again["deep"]) == ("a/b", 3, None, [{"p": [1, 2.5]}])
     assert names(tmp_path) == ["a.json"]
+
+
+@pytest.mark.parametrize("kind", ["loop", "file", "below a file", "long", "null"])
+def test_where_no_folder_can_be_is_told_before_anything_is_computed(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (tmp_path / "file").write_text("mine")
+    path = {"below a file": tmp_path / "file" / "run", "long": tmp_path / ("x" * 5000), "null": tmp_path / "a\0b"}.get(
+        kind, tmp_path / kind
+    )
+    with pytest.raises(InputError) as raised:
+        check_new_folder(path)
+    assert len(str(raised.value)) < 500
+    with pytest.raises(InputError), new_folder(path):
+        pass
+    assert names(tmp_path) == ["file", "loop"]
+    assert check_new_folder(tmp_path / "new" / "run") == tmp_path.resolve() / "new" / "run"

@@ -25,8 +25,8 @@ MAY_IMPORT = {
 # anatomy, geometry and volumes only, and `registration` takes a `Case`. `evaluation` compares a result with the case's
 # truth, so it comes late.
 ROOMS = (
-    "errors", "exchange", "files", "extras", "configs", "settings", "extensions", "anatomy",
-    "geometry", "volume", "drr", "fluoro", "case",
+    "errors", "text", "arrays", "tensors", "exchange", "files", "extras", "configs", "settings", "extensions",
+    "anatomy", "geometry", "volume", "drr", "fluoro", "case",
     "detect", "pnp", "similarity", "optimize", "registration", "navigation", "neighbours", "planning",
     "evaluation", "review", "beads", "intake", "statistics", "commands",
 )  # fmt: skip

@@ -18,6 +18,7 @@ from torch.nn import functional as F
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import normalise
+from femoreg_torch.settings import check_rising, check_within
 
 _COARSE_KNOTS, _FINE_KNOTS = 4, 14  # along each axis of the image, of the fields `unevenness` and `gas`
 
@@ -50,6 +51,31 @@ class AugmentationSettings:
     scale: tuple[float, float] = (0.85, 1.15)
     shift_px: float = 20.0
     flipped_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        shares = [name for name in self.__dataclass_fields__ if name.endswith("_share")]
+        check_within(
+            self,
+            **dict.fromkeys(shares, (0.0, 1.0)),
+            tissue=(0, 10),
+            bone=(0, 10),
+            bone_spread=(0, 1),
+            unevenness=(0, 10),
+            gas=(0, 10),
+            device=(1e-3, 100),
+            vignetting=(0, 1),
+            scatter=(0, 100),
+            photons=(1, 1e15),
+            blur_px=(1e-3, 20),
+            gamma=(0.01, 10),
+            collimated_middle=(0, 1),
+            collimated_half=(0.01, 1),
+            rotation_deg=(0, 180),
+            scale=(0.1, 10),
+            shift_px=(0, 192),
+        )
+        pairs = ("tissue", "bone", "device", "scatter", "photons", "blur_px", "gamma", "scale")
+        check_rising(self, *pairs, "collimated_middle", "collimated_half")
 
 
 class Batch(NamedTuple):

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from safetensors import safe_open
 
 from femoreg_torch.detect import network_camera
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import load_carm
+from femoreg_torch.settings import SEEDS, check_within
+from femoreg_torch.tensors import read_metadata
 from femoreg_torch.volume import read_ct, read_labels, read_landmarks
 from sim.labelled.attenuation_layers import Layers, deform, smooth_displacement, split_layers
 from sim.labelled.layer_landmarks import landmarks_by_rule
@@ -41,6 +42,20 @@ class CohortSettings:
     landmarks: Literal["carried", "rules"] = "carried"  # of a variant: moved with the bone, or found on it anew
     devices: int = 0  # images of devices to lay over the views
     ranges: ViewRanges = field(default_factory=ViewRanges)
+
+    def __post_init__(self) -> None:
+        check_within(
+            self,
+            patient_seeds=SEEDS,
+            validation_seeds=SEEDS,
+            patient_spacing_mm=(0.3, 5),
+            patient_variants=(1, 10_000),
+            case_variants=(1, 10_000),
+            views=(1, 100_000),
+            deformation_mm=(0, 50),
+            seed=SEEDS,
+            devices=(0, 100_000),
+        )
 
 
 @dataclass(frozen=True)
@@ -120,7 +135,8 @@ def _variants(
 
 
 def _check_source(file: Path, source: str) -> None:
-    with safe_open(file, "pt") as content:
-        found = content.metadata().get("source")
+    found = read_metadata(file).get("source")
     if found != source:
-        raise InputError(f"{file}: rendered with other settings ({found}). Choose an empty cache folder.")
+        raise InputError(
+            f"{file}: rendered with other settings ({shortened(found, 300)}). Choose an empty cache folder."
+        )

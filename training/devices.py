@@ -4,14 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from femoreg_torch.drr import project
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera
+from femoreg_torch.tensors import read_metadata, read_tensors, write_tensors
 from sim.labelled.devices_in_view import device_pose
 from sim.labelled.settings import DeviceRanges
 from sim.physics.line_integrals import device_density
@@ -31,10 +30,11 @@ def render_devices(path: Path, count: int, camera: Camera, seed: int) -> Path:
     """
     source = f"{count} devices on {camera.shape}, seed {seed}, {_RANGES}"
     if path.exists():
-        with safe_open(path, "pt") as content:
-            found = content.metadata().get("source")
+        found = read_metadata(path).get("source")
         if found != source:
-            raise InputError(f"{path}: rendered with other settings ({found}). Choose an empty cache folder.")
+            raise InputError(
+                f"{path}: rendered with other settings ({shortened(found, 300)}). Choose an empty cache folder."
+            )
         return path
     rng = np.random.default_rng(seed)
     made = [make_device(_FIRST_SEED + n) for n in range(_RANGES.count)]
@@ -45,10 +45,10 @@ def render_devices(path: Path, count: int, camera: Camera, seed: int) -> Path:
         pose = device_pose(*made[which], _RANGES, rng)
         shadows.append(project([densities[which]], pose[None, None], camera, _STEP_MM)[0] / 10 * _CM2_PER_G)
     with temporary_file(path) as part:
-        save_file({"shadows": torch.stack(shadows).half()}, part, metadata={"source": source})
+        write_tensors(part, {"shadows": torch.stack(shadows).half()}, {"source": source})
     return path
 
 
 def read_devices(path: Path) -> Tensor:
     """The attenuation images (N, H, W) of a file of `render_devices`."""
-    return load_file(path)["shadows"]
+    return read_tensors(path, ("shadows",))[1]["shadows"]

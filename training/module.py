@@ -8,6 +8,7 @@ from lightning import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
+from femoreg_torch.settings import check_within
 from models.protocols import Loss, Network, Prediction
 from training.augmentation import Batch
 
@@ -25,6 +26,20 @@ class OptimisationSettings:
     warm_up: float = 0.05  # share of all steps
     averaging: float = 0.998  # decay of the moving average of the weights that is validated and exported
     patience: int = 0  # epochs without a better validation loss before training stops early; 0: never
+
+    def __post_init__(self) -> None:
+        check_within(
+            self,
+            epochs=(1, 100_000),
+            batches_per_epoch=(1, 1_000_000),
+            validation_batches=(1, 1_000_000),
+            batch_size=(1, 4096),
+            learning_rate=(1e-9, 10),
+            weight_decay=(0, 10),
+            warm_up=(0, 1),
+            averaging=(0, 0.999_999),
+            patience=(0, 100_000),
+        )
 
 
 def landmark_errors_px(prediction: Prediction, landmarks: Tensor, visible: Tensor) -> Tensor:

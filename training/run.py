@@ -26,6 +26,7 @@ from femoreg_torch.detect.grid import NETWORK_SIZE
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file, write_json
 from models.weights import SHIPPED_WEIGHTS, Weights, save_weights
+from training.checkpoints import last_good_checkpoint, read_checkpoint
 from training.cohort import render_cohort
 from training.curves import draw_curves
 from training.data import ViewData
@@ -65,11 +66,16 @@ def train_network(
     """
     console = Console()
     last = out / "checkpoints" / "last.ckpt"
-    if resume and not last.is_file():
+    if resume and not any(last.parent.glob("*.ckpt")):
         raise InputError(f"{last}: no such file, so there is nothing to resume. Leave out --resume.")
     if last.is_file() and not resume:
         raise InputError(f"{out}: holds a training run. Continue it with --resume, or choose another folder.")
+    _check_machine(machine)
     run = settings.run
+    resumed = None
+    if resume:
+        like = NetworkTraining(settings.network, settings.loss, run.optimisation)
+        resumed = last_good_checkpoint(last.parent, like, console.print)
     torch.set_num_threads(run.threads)
     cohort = render_cohort(run.cohort, cases, cache, console.print)
     out.mkdir(parents=True, exist_ok=True)
@@ -113,11 +119,21 @@ def train_network(
         log_every_n_steps=min(25, optimisation.batches_per_epoch),
         limit_val_batches=1.0 if cohort.validation else 0,
     )
-    trainer.fit(module, data, ckpt_path=last if resume else None)
+    trainer.fit(module, data, ckpt_path=resumed)
     if not trainer.is_global_zero:  # one process writes
         return out / SHIPPED_WEIGHTS
     draw_curves(out / "tensorboard", out / "curves.png")
     return export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
+
+
+def _check_machine(machine: Machine) -> None:
+    """Raises `InputError` for accelerators that this machine does not have."""
+    there = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if machine.accelerator == "cuda" and there < machine.devices:
+        raise InputError(
+            f"--device cuda: {machine.devices} GPUs were asked for, torch sees {there}. "
+            "Train on the CPU, or see what `femoreg doctor` says."
+        )
 
 
 def progress_bar(console: Console) -> ProgressBar:
@@ -147,7 +163,7 @@ def begin_with(path: Path, network: nn.Module) -> None:
 
 def export_weights(checkpoint: Path, settings: TrainingSettings, path: Path) -> Path:
     """Write the averaged weights of a checkpoint as safetensors."""
-    content = torch.load(checkpoint, weights_only=True)
+    content = read_checkpoint(checkpoint)
     module = NetworkTraining(settings.network, settings.loss, settings.run.optimisation)
     module.load_state_dict(content["state_dict"])
     known = settings.as_content()

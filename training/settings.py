@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final, Literal
 
-import yaml
 from femoreg_torch.configs import laid_over, load_preset
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect.weights import NETWORKS_GROUP, check_counts
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.extensions import pop_kind, read_kind
-from femoreg_torch.settings import read_record
+from femoreg_torch.settings import SEEDS, check_within, read_record
+from femoreg_torch.text import yaml_content
 from models.kinds import LOSSES, NETWORKS
 from models.protocols import Loss, Network
 from training.augmentation import AugmentationSettings
@@ -36,6 +36,9 @@ class Run:
     threads: int = 1  # of the training process
     workers: int = 1  # processes that make batches
     precision: Precision = "32-true"  # bf16-mixed halves the time on CPUs that know bf16
+
+    def __post_init__(self) -> None:
+        check_within(self, seed=SEEDS, threads=(1, 1024), workers=(0, 1024))
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ def read_settings(name: str, overrides: Sequence[str] = ()) -> TrainingSettings:
     where = f"training settings {name}"
     content = load_preset("training", name)
     for override in overrides:
-        content = laid_over(content, _override(override), f"{where}, {override}")
+        content = laid_over(content, _override(override), f"{where}, {shortened(override)}")
     network, loss = (content.pop(group, None) for group in ("network", "loss"))
     network_kind, _ = pop_kind(network, f"{where}, network")
     loss_kind, _ = pop_kind(loss, f"{where}, loss")
@@ -83,11 +86,10 @@ def _override(text: str) -> dict[str, Any]:
     """What `group.key=value` says, as the content of a settings file."""
     path, equals, value = text.partition("=")
     if not equals:
-        raise InputError(f"--override {text}: group.key=value was expected, for instance optimisation.epochs=3.")
-    try:
-        change = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise InputError(f"--override {text}: the value is not YAML ({' '.join(str(error).split())}).") from error
+        raise InputError(
+            f"--override {shortened(text)}: group.key=value was expected, for instance optimisation.epochs=3."
+        )
+    change = yaml_content(value, f"--override {shortened(text)}")
     for key in reversed(path.split(".")):
         change = {key: change}
     return change

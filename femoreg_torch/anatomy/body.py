@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from femoreg_torch.configs import load_preset
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.settings import read_record
 
 
@@ -96,7 +96,7 @@ class Anatomy:
         for name in names:
             if name not in self.groups and name not in self.bone_names:
                 known = ", ".join((*self.bone_names, *self.groups))
-                raise InputError(f"anatomy {self.name}: there is no bone {name!r}. Known names: {known}.")
+                raise InputError(f"anatomy {self.name}: there is no bone {shortened(name)}. Known names: {known}.")
             found += self.groups.get(name, (name,))
         return tuple(found)
 
@@ -142,7 +142,9 @@ def load_anatomy(name: str | Path) -> Anatomy:
     anatomy.members(*(landmark.bone for landmark in anatomy.landmarks))
     for landmark in anatomy.landmarks:
         if landmark.mirror not in anatomy.landmark_names:
-            raise InputError(f"{where}, landmarks.{landmark.name}.mirror: there is no landmark {landmark.mirror!r}.")
+            raise InputError(
+                f"{where}, landmarks.{landmark.name}.mirror: there is no landmark {shortened(landmark.mirror)}."
+            )
     return anatomy
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from femoreg_torch.anatomy.body import Anatomy
 from femoreg_torch.configs import load_preset, preset_names
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 
 _GROUP = "anatomy/labels"
 LARGEST_ID = 65535
@@ -35,7 +35,7 @@ def label_ids(value: object, where: str) -> tuple[int, ...]:
     """One id, or a list of ids, as a tuple. Raises `InputError` that starts with `where`."""
     ids = value if isinstance(value, list) else [value]
     if not ids or not all(type(n) is int and 0 < n <= LARGEST_ID for n in ids):
-        raise InputError(f"{where}: a label id above 0, or a list of them, was expected, found {str(value)[:60]}.")
+        raise InputError(f"{where}: a label id above 0, or a list of them, was expected, found {shortened(value)}.")
     return tuple(ids)
 
 

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from scipy import ndimage
 from torch import Tensor
 
@@ -13,9 +12,10 @@ from femoreg_torch.beads.ct import find_beads
 from femoreg_torch.beads.model import Beads, check_beads
 from femoreg_torch.case import Case
 from femoreg_torch.case.fields import Fields
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import read_csv
 from femoreg_torch.registration.prepare import read_bones
+from femoreg_torch.text import read_yaml
 from femoreg_torch.volume import read_landmarks
 
 COLUMNS = ("image", "bead", "column_px", "row_px")
@@ -48,15 +48,7 @@ def read_beads(path: Path, case: Case) -> Given:
     Raises `InputError` that names file and key.
     """
     path = Path(path)
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file.") from error
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())}).") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: a mapping of keys and values was expected, found {type(content).__name__}.")
-    top = Fields(content, str(path)).only("objects", "annotations", "image_noise_px", "views")
+    top = Fields(read_yaml(path), str(path)).only("objects", "annotations", "image_noise_px", "views")
     entries = top.mapping("objects")
     if not entries.content:
         raise InputError(f"{top.where('objects')}: is empty. Name at least one object with beads.")
@@ -66,7 +58,9 @@ def read_beads(path: Path, case: Case) -> Given:
     beads = tuple(_object(entries.mapping(name), name, case, path.parent) for name in entries.content)
     names = [bead for thing in beads for bead in thing.names]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"{top.where('objects')}: two beads are named {repeated[0]!r}. Give every bead its own name.")
+        raise InputError(
+            f"{top.where('objects')}: two beads are named {shortened(repeated[0])}. Give every bead its own name."
+        )
     marks = read_marks(top.file_path("annotations", path.parent), names, case) if "annotations" in top else None
     noise = _positive(top, "image_noise_px") if "image_noise_px" in top else None
     first = "views" in top and top.choice("views", ("all", "first")) == "first"
@@ -99,7 +93,7 @@ def _in_ct(fields: Fields, name: str, case: Case, diameter_mm: float) -> Tensor:
         )
     count = fields.value("count", "the number of beads")
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
-        raise InputError(f"{fields.where('count')}: a whole number of beads was expected, found {count!r}.")
+        raise InputError(f"{fields.where('count')}: a whole number of beads was expected, found {shortened(count)}.")
     ct, bones = read_bones(case)
     mask = torch.isin(bones.labels.data, torch.tensor(bones.of(thing.bones, case.anatomy), dtype=torch.uint8))
     voxels = [round(_AROUND_MM / s) for s in ct.spacing_mm[::-1]]
@@ -128,10 +122,12 @@ def read_marks(path: Path, names: list[str], case: Case) -> dict[str, tuple[Mark
     for line, row in enumerate(rows, 2):
         image = images.get((row["image"] or "").strip())
         if image is None:
-            raise InputError(f"{path}, line {line}: the case has no image {row['image']!r}, but {', '.join(images)}.")
+            raise InputError(
+                f"{path}, line {line}: the case has no image {shortened(row['image'])}, but {', '.join(images)}."
+            )
         bead = (row["bead"] or "").strip() or None
         if bead is not None and bead not in names:
-            raise InputError(f"{path}, line {line}: there is no bead {bead!r}, but {', '.join(names)}.")
+            raise InputError(f"{path}, line {line}: there is no bead {shortened(bead)}, but {', '.join(names)}.")
         column, height = (
             _pixel(row[key], size, f"{path}, line {line}, {key}")
             for key, size in (("column_px", columns_px), ("row_px", rows_px))
@@ -149,5 +145,5 @@ def _pixel(value: Any, size: int, where: str) -> float:
     except (TypeError, ValueError):
         number = float("nan")
     if not -0.5 <= number <= size - 0.5:
-        raise InputError(f"{where}: a pixel of the image from 0 to {size - 1} was expected, found {value!r}.")
+        raise InputError(f"{where}: a pixel of the image from 0 to {size - 1} was expected, found {shortened(value)}.")
     return number

@@ -35,7 +35,7 @@ from femoreg_torch.case.parts import (
     view_of,
     with_known_poses,
 )
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.settings import read_record
 from femoreg_torch.volume import read_landmarks, read_path_points
 
@@ -76,7 +76,7 @@ def _structures(ct: Fields, side: Side) -> LabelTable:
         where = structures.where(name)
         value = structures.value(name, "a list of label ids")
         if not isinstance(value, list):
-            raise InputError(f"{where}: a list of label ids was expected, found {str(value)[:60]}.")
+            raise InputError(f"{where}: a list of label ids was expected, found {shortened(value)}.")
         ids = label_ids(value, where)
         for other, taken in found.items():
             if shared := set(ids) & set(taken):
@@ -143,7 +143,7 @@ def _target(plan: Fields, landmarks: dict[str, Tensor], side: Side) -> Tensor:
         stems = ", ".join(dict.fromkeys(known.rpartition("-")[0] for known in HIP.landmark_names))
         raise InputError(
             f"{plan.where('target')}: one of {stems} (of the operated side) or a point [x, y, z] in LPS mm was "
-            f"expected, found {target[:60]!r}."
+            f"expected, found {shortened(target)}."
         )
     if name not in landmarks:
         raise InputError(f"{plan.where('target')}: landmark {name} is not in the landmark file.")

@@ -8,8 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import check_rigid, read_itk_transform
+from femoreg_torch.geometry.rigid import FARTHEST_MM
+
+_LONGEST_PATH = 120  # characters of the keys that lead to a value, in messages
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,8 @@ class Fields:
 
     def where(self, key: str) -> str:
         """`file, path.to.key`, the beginning of every message."""
-        return f"{self.file}, {self.path}.{key}" if self.path else f"{self.file}, {key}"
+        path = f"{self.path}.{key}" if self.path else key
+        return f"{self.file}, {path if len(path) <= _LONGEST_PATH else path[: _LONGEST_PATH - 1] + '…'}"
 
     def only(self, *known: str) -> "Fields":
         """Itself, if no key stands in it that is not `known`."""
@@ -44,14 +48,14 @@ class Fields:
         """The mapping under `key`."""
         value = self.value(key, "a mapping")
         if not isinstance(value, dict):
-            raise InputError(f"{self.where(key)}: a mapping of keys and values was expected, found {_short(value)}.")
+            raise InputError(f"{self.where(key)}: a mapping of keys and values was expected, found {shortened(value)}.")
         return Fields(value, self.file, f"{self.path}.{key}" if self.path else key)
 
     def mappings(self, key: str) -> list["Fields"]:
         """The list of mappings under `key`."""
         value = self.value(key, "a list")
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-            raise InputError(f"{self.where(key)}: a list of mappings was expected, found {_short(value)}.")
+            raise InputError(f"{self.where(key)}: a list of mappings was expected, found {shortened(value)}.")
         prefix = f"{self.path}.{key}" if self.path else key
         return [Fields(item, self.file, f"{prefix}[{n}]") for n, item in enumerate(value)]
 
@@ -59,14 +63,14 @@ class Fields:
         """One of the `allowed` words under `key`."""
         value = self.value(key, " or ".join(allowed))
         if value not in allowed:
-            raise InputError(f"{self.where(key)}: {' or '.join(allowed)} was expected, found {_short(value)}.")
+            raise InputError(f"{self.where(key)}: {' or '.join(allowed)} was expected, found {shortened(value)}.")
         return value
 
     def text(self, key: str, expected: str) -> str:
         """The text under `key`; `expected` says in words what should stand there."""
         value = self.value(key, expected)
         if not isinstance(value, str) or not value:
-            raise InputError(f"{self.where(key)}: {expected} was expected, found {_short(value)}.")
+            raise InputError(f"{self.where(key)}: {expected} was expected, found {shortened(value)}.")
         return value
 
     def texts(self, key: str, expected: str) -> list[str]:
@@ -74,12 +78,21 @@ class Fields:
         value = self.value(key, expected)
         items = value if isinstance(value, list) else [value]
         if not items or not all(isinstance(item, str) and item for item in items):
-            raise InputError(f"{self.where(key)}: {expected} was expected, found {_short(value)}.")
+            raise InputError(f"{self.where(key)}: {expected} was expected, found {shortened(value)}.")
         return items
 
     def number(self, key: str) -> float:
         """The finite number under `key`."""
         return self._numbers(key, (), "a number").item()
+
+    def whole(self, key: str, low: int, high: int) -> int:
+        """The whole number from `low` to `high` under `key`."""
+        value = self.value(key, "a whole number")
+        if type(value) is not int or not low <= value <= high:
+            raise InputError(
+                f"{self.where(key)}: a whole number from {low} to {high} was expected, found {shortened(value)}."
+            )
+        return value
 
     def numbers(self, key: str, count: int) -> list[float]:
         """So many finite numbers under `key`."""
@@ -87,7 +100,10 @@ class Fields:
 
     def point(self, key: str) -> Tensor:
         """The point (3,), float64, under `key`."""
-        return self._numbers(key, (3,), "a point [x, y, z] in mm")
+        point = self._numbers(key, (3,), "a point [x, y, z] in mm")
+        if point.abs().max() > FARTHEST_MM:
+            raise InputError(f"{self.where(key)}: {point.abs().max():.3g} mm is farther than any room. Is it in mm?")
+        return point
 
     def matrix(self, key: str, shape: tuple[int, int]) -> Tensor:
         """The matrix of finite numbers, float64, under `key`."""
@@ -107,7 +123,7 @@ class Fields:
         """The list of rigid transforms under `key` as (V, 4, 4), float64."""
         value = self.value(key, "a list of 4×4 matrices")
         if not isinstance(value, list) or not value:
-            raise InputError(f"{self.where(key)}: a list of 4×4 matrices was expected, found {_short(value)}.")
+            raise InputError(f"{self.where(key)}: a list of 4×4 matrices was expected, found {shortened(value)}.")
         items = Fields({f"{key}[{n}]": item for n, item in enumerate(value)}, self.file, self.path)
         return torch.stack([items.transform(name) for name in items.content])
 
@@ -115,28 +131,30 @@ class Fields:
         """The existing file under `key`, relative to `folder` unless absolute."""
         value = self.value(key, "the path of a file")
         if not isinstance(value, str):
-            raise InputError(f"{self.where(key)}: the path of a file was expected, found {_short(value)}.")
+            raise InputError(f"{self.where(key)}: the path of a file was expected, found {shortened(value)}.")
         path = folder / value
-        if not (path.is_file() or (may_be_folder and path.is_dir())):
-            raise InputError(f"{self.where(key)}: there is no file {path}. Paths are relative to {self.file}.")
+        try:
+            there = path.is_file() or (may_be_folder and path.is_dir())
+        except (OSError, ValueError):  # a name that is too long, holds a null byte, or leads to itself
+            there = False
+        if not there:
+            raise InputError(
+                f"{self.where(key)}: there is no file {shortened(value, 200)}. Paths are relative to {self.file}."
+            )
         return path
 
     def _numbers(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:
         value = self.value(key, expected)
-        try:
+        numbers = torch.empty(0)
+        if _fits(value, shape):
             numbers = torch.tensor(value, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError):
-            numbers = torch.empty(0)
-        if isinstance(value, bool) or numbers.shape != shape or not torch.isfinite(numbers).all():
-            raise InputError(f"{self.where(key)}: {expected} was expected, found {_short(value)}.")
+        if numbers.shape != shape or not torch.isfinite(numbers).all():
+            raise InputError(f"{self.where(key)}: {expected} was expected, found {shortened(value)}.")
         return numbers
 
 
-def _short(value: Any) -> str:
-    """What was found, in a few characters."""
-    text = (
-        repr(value)
-        if isinstance(value, str | int | float | type(None))
-        else f"{type(value).__name__} {str(value)[:60]}"
-    )
-    return text if len(text) <= 80 else text[:77] + "…"
+def _fits(value: Any, shape: tuple[int, ...]) -> bool:
+    """Whether a value is a number, or lists of numbers of this shape."""
+    if not shape:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, list) and len(value) == shape[0] and all(_fits(item, shape[1:]) for item in value)

@@ -10,6 +10,7 @@ from femoreg_torch.volume.materials import DENSITIES
 
 MODEL_KEYS = ("model", "volume", "labels", "hu", "material", "parts")
 _VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
+_AIR_HU, _MOST_HU = -1000.0, 1e6  # tungsten, the densest that devices have parts of, has some 350,000
 _BODIES_SUFFIXES = (".3mf", ".obj", ".glb")  # of files that hold several bodies with names
 
 
@@ -87,7 +88,13 @@ def _material(entry: Fields) -> tuple[float | None, str | None]:
     """The `hu` or the name of the `material`; the other is None."""
     if "material" not in entry:
         entry.value("hu", "a number, or `material` in its place,")
-        return entry.number("hu"), None
+        hu = entry.number("hu")
+        if not _AIR_HU < hu <= _MOST_HU:
+            raise InputError(
+                f"{entry.where('hu')}: HU of a solid, above {_AIR_HU:g} (air) and up to {_MOST_HU:g}, were expected, "
+                f"found {hu:g}."
+            )
+        return hu, None
     if "hu" in entry:
         raise InputError(f"{entry.where('material')}: `hu` is given too. Keep one of the two.")
     return None, entry.choice("material", tuple(DENSITIES))

@@ -10,9 +10,10 @@ from femoreg_torch.anatomy import Anatomy, LabelTable
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.model import CaseObject, PlannedPath, Side, Start
 from femoreg_torch.case.models import MODEL_KEYS, is_model, read_model
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import read_json
 
+_LONGEST_NAME = 100
 _BY_LANDMARKS = "landmarks"
 _RESERVED = ("all", "each", "view", "views", "intrinsics", "camera1")  # words of presets, and of names of poses
 
@@ -29,6 +30,10 @@ def read_object(
 
     Raises `InputError` that names file and key for whatever does not fit.
     """
+    if len(name) > _LONGEST_NAME:
+        raise InputError(
+            f"{entries.where(shortened(name))}: a name of at most {_LONGEST_NAME} characters was expected."
+        )
     entry = entries.mapping(name).only("bones", *MODEL_KEYS, "reference", "points", "images", "start")
     if not name.isidentifier() or name in _RESERVED:
         raise InputError(
@@ -61,7 +66,7 @@ def _bones(entry: Fields, bones: LabelTable, anatomy: Anatomy | None) -> tuple[s
         inside = anatomy.groups.get(name, (name,)) if anatomy else (name,)
         if name not in bones and not any(bone in bones for bone in inside):
             raise InputError(
-                f"{entry.where('bones')}: `ct.bones` has no {name!r}. It has: {', '.join(bones) or 'nothing'}."
+                f"{entry.where('bones')}: `ct.bones` has no {shortened(name)}. It has: {', '.join(bones) or 'nothing'}."
             )
     return tuple(names)
 
@@ -75,7 +80,7 @@ def _reference(entry: Fields, points: Mapping[str, Tensor], landmarks: Mapping[s
     known = {**landmarks, **points}
     if value not in known:
         raise InputError(
-            f"{entry.where('reference')}: there is no point {value[:60]!r}. There are: {', '.join(known)}."
+            f"{entry.where('reference')}: there is no point {shortened(value)}. There are: {', '.join(known)}."
         )
     return known[value]
 
@@ -137,7 +142,7 @@ def read_plan(
         known = {**landmarks, **objects[name].points}
         if target not in known:
             raise InputError(
-                f"{points.where('target')}: there is no point {target[:60]!r}. There are: {', '.join(known)}."
+                f"{points.where('target')}: there is no point {shortened(target)}. There are: {', '.join(known)}."
             )
         end = known[target]
     else:

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import yaml
-
 from femoreg_torch.case import femoroplasty_form
 from femoreg_torch.case.femoroplasty import TEMPLATE
 from femoreg_torch.case.fields import Fields
@@ -17,7 +15,8 @@ from femoreg_torch.case.parts import (
     read_view,
     with_known_poses,
 )
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.text import read_yaml
 from femoreg_torch.volume import read_landmarks
 
 VERSIONS = (1, 2)
@@ -32,13 +31,7 @@ def read_fields(folder: Path) -> Fields:
             f"{folder}: not a case folder, it holds no case.yaml. Make one with `femoreg new-case` or "
             "`femoreg simulate`."
         )
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as YAML ({' '.join(str(error).split())}).") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: a mapping of keys and values was expected, found {type(content).__name__}.")
-    return Fields(content, str(path))
+    return Fields(read_yaml(path), str(path))
 
 
 def read_case(folder: Path) -> Case:
@@ -51,7 +44,9 @@ def read_case(folder: Path) -> Case:
     version = top.value("version", " or ".join(map(str, VERSIONS)))
     if version not in VERSIONS or isinstance(version, bool):
         known = " and ".join(map(str, VERSIONS))
-        raise InputError(f"{top.where('version')}: this FemoReg Torch reads versions {known}, found {version!r}.")
+        raise InputError(
+            f"{top.where('version')}: this FemoReg Torch reads versions {known}, found {shortened(version)}."
+        )
     if version == 1:
         return femoroplasty_form.read_version_1(top, folder)
     if "template" in top:
@@ -102,6 +97,6 @@ def _check_kinds(case: Case, top: Fields) -> None:
         for kind in thing.images or ():
             if kind not in case.kinds:
                 raise InputError(
-                    f"{top.where('objects')}.{name}.images: no view has an image {kind!r}. There are: "
+                    f"{top.where('objects')}.{name}.images: no view has an image {shortened(kind)}. There are: "
                     f"{', '.join(case.kinds)}."
                 )

@@ -20,6 +20,7 @@ RESULT_NAME = "result.json"
 SCHEMA = 2
 _KNOWN = (1, SCHEMA)
 _NAN = float("nan")
+_MANY = 2**53  # evaluations
 
 
 def result_content(result: Result) -> dict[str, Any]:
@@ -96,12 +97,13 @@ def read_result(run: Path) -> Result:
     top = Fields(read_json(path), str(path))
     poses = _poses(top)
     names = tuple(poses.camera1_from)
+    views = len(poses.camera_from_camera1)
     return Result(
         poses=poses,
-        quality=_quality(top),
+        quality=_quality(top, views),
         start=_start(top.mapping("start")) if "start" in top else None,
         cameras=_cameras(top),
-        stages=tuple(_stages(top, poses)),
+        stages=tuple(_stage(stage, poses) for stage in (top.mappings("stages") if "stages" in top else [])),
         skipped=tuple(top.texts("skipped", "a list of sentences")) if top.content.get("skipped") else (),
         path=_path(top, names),
         points_camera1=_vectors(top, "points_camera1"),
@@ -109,7 +111,7 @@ def read_result(run: Path) -> Result:
         path_covariance=top.matrix("path_covariance", (6, 6)) if "path_covariance" in top else None,
         timings_s=_numbers(top, "timings_s"),
         preset=str(top.content.get("preset", "")),
-        seed=int(top.number("seed")) if "seed" in top else 0,
+        seed=top.whole("seed", 0, 2**63 - 1) if "seed" in top else 0,
         versions={str(key): str(value) for key, value in _mapping(top, "versions").items()},
         errors=_mapping(top, "errors") if "errors" in top else None,
         case=top.text("case", "a folder") if "case" in top else None,
@@ -242,22 +244,22 @@ def _number_or_none(fields: Fields, key: str) -> float | None:
     return fields.number(key) if key in fields else None
 
 
-def _quality(top: Fields) -> dict[str, ObjectQuality]:
+def _quality(top: Fields, views: int) -> dict[str, ObjectQuality]:
     if "quality" not in top:
         return {}
     fields = top.mapping("quality")
-    return {name: _object_quality(fields.mapping(name)) for name in fields.content}
+    return {name: _object_quality(fields.mapping(name), views) for name in fields.content}
 
 
-def _object_quality(fields: Fields) -> ObjectQuality:
-    """The quality of one object; a measure that is missing or was no number is nan."""
+def _object_quality(fields: Fields, count: int) -> ObjectQuality:
+    """The quality of one object in so many views; a measure that is missing or was no number is nan."""
     views = fields.mappings("views") if "views" in fields else []
     displacement = fields.numbers("displacement", 2) if "displacement" in fields else None
     reason = fields.content.get("reason")
     return ObjectQuality(
         views=tuple(
             ViewQuality(
-                view=int(view.number("view")),
+                view=view.whole("view", 1, count),
                 similarity=_number(view, "similarity"),
                 gain=_number(view, "gain"),
                 pull_mm=_several(view, "pull_mm", 2),
@@ -289,37 +291,39 @@ def _several(fields: Fields, key: str, count: int) -> Any:
     return tuple(_number(items, name) for name in items.content)
 
 
-def _stages(top: Fields, poses: Poses) -> list[StageRecord]:
-    stages = []
-    for stage in top.mappings("stages") if "stages" in top else []:
-        placed = _placed(stage, replace(poses, changes=()))
-        stages.append(
-            StageRecord(
-                name=stage.text("name", "the name of the stage"),
-                view=int(stage.number("view")) if "view" in stage else None,
-                cost=_number(stage, "cost"),
-                evaluations=int(stage.number("evaluations")),
-                seconds=_number(stage, "seconds"),
-                stop=str(stage.content.get("stop", "")),
-                poses=placed,
-                restarts=tuple(
-                    Restart(_number(end, "cost"), _number(end, "apart_deg"), _number(end, "apart_mm"))
-                    for end in (stage.mappings("restarts") if "restarts" in stage else [])
-                ),
-                moments=tuple(
-                    Moment(int(moment.number("evaluations")), _number(moment, "cost"), _placed(moment, placed))
-                    for moment in (stage.mappings("moments") if "moments" in stage else [])
-                ),
-            )
-        )
-    return stages
+def _stage(stage: Fields, poses: Poses) -> StageRecord:
+    """One step of a registration that ended at `poses`."""
+    placed = _placed(stage, replace(poses, changes=()))
+    return StageRecord(
+        name=stage.text("name", "the name of the stage"),
+        view=stage.whole("view", 1, len(poses.camera_from_camera1)) if "view" in stage else None,
+        cost=_number(stage, "cost"),
+        evaluations=stage.whole("evaluations", 0, _MANY),
+        seconds=_number(stage, "seconds"),
+        stop=str(stage.content.get("stop", "")),
+        poses=placed,
+        restarts=tuple(
+            Restart(_number(end, "cost"), _number(end, "apart_deg"), _number(end, "apart_mm"))
+            for end in (stage.mappings("restarts") if "restarts" in stage else [])
+        ),
+        moments=tuple(
+            Moment(moment.whole("evaluations", 0, _MANY), _number(moment, "cost"), _placed(moment, placed))
+            for moment in (stage.mappings("moments") if "moments" in stage else [])
+        ),
+    )
 
 
 def _placed(fields: Fields, otherwise: Poses) -> Poses:
     """The poses of a stage or a moment; those that it does not tell are `otherwise`."""
     poses = otherwise
     if "camera_from_camera1" in fields:
-        poses = replace(poses, camera_from_camera1=fields.transforms("camera_from_camera1"))
+        cameras = fields.transforms("camera_from_camera1")
+        if len(cameras) != len(otherwise.camera_from_camera1):
+            raise InputError(
+                f"{fields.where('camera_from_camera1')}: {len(otherwise.camera_from_camera1)} views were expected, "
+                f"found {len(cameras)}."
+            )
+        poses = replace(poses, camera_from_camera1=cameras)
     if "carm_refined" in fields:
         poses = replace(poses, changes=_changes(fields, len(poses.camera_from_camera1)))
     placed = fields.mapping("camera1_from")

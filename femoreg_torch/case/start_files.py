@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.case.fields import Fields
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import read_csv, read_json
 from femoreg_torch.volume import read_landmarks
 
 COLUMNS = ("landmark", "column_px", "row_px")
 _POSE = "camera1_from_"
+_FARTHEST_PX = 1e5  # of a landmark, which may lie outside of the image
 
 
 def read_pixels(path: Path) -> dict[str, Tensor]:
@@ -35,12 +36,14 @@ def read_pixels(path: Path) -> dict[str, Tensor]:
         if row.get("visible", "1") in ("0", "False", "false"):
             continue
         if not name or name in found:
-            raise InputError(f"{path}, line {number}: the name of a landmark was expected, each once; found {name!r}.")
+            raise InputError(
+                f"{path}, line {number}: the name of a landmark was expected, each once; found {shortened(name)}."
+            )
         try:
             pixel = torch.tensor([float(row["column_px"]), float(row["row_px"])], dtype=torch.float64)
         except (TypeError, ValueError):
             pixel = torch.full((2,), torch.nan)
-        if not torch.isfinite(pixel).all():
+        if not torch.isfinite(pixel).all() or pixel.abs().max() > _FARTHEST_PX:
             raise InputError(f"{path}, line {number}: two finite numbers, column_px and row_px, were expected.")
         found[name] = pixel
     if not found:

@@ -96,7 +96,7 @@ def _jobs(
     """What is to be done. Raises `InputError` for cases that would be written to one place, and for no jobs."""
     import os
 
-    from femoreg_torch.errors import InputError
+    from femoreg_torch.errors import InputError, shortened
     from femoreg_torch.registration import load_plan
 
     if count < 1:
@@ -106,7 +106,7 @@ def _jobs(
     for name in names:
         if names.count(name) > 1:
             raise InputError(
-                f"{names.count(name)} cases are called {name!r}: their runs would be one folder. Rename them."
+                f"{names.count(name)} cases are called {shortened(name)}: their runs would be one folder. Rename them."
             )
     threads = max(1, len(os.sched_getaffinity(0)) // count)
     return [

@@ -9,6 +9,7 @@ Only the chosen command is imported.
 
 import ast
 import inspect
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib.machinery import PathFinder
@@ -19,17 +20,28 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import femoreg_torch
 from femoreg_torch.commands.status import BAD_INPUT, DONE, INTERRUPTED
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, defect_in_one_line, shortened
 from femoreg_torch.extras import missing_extra
 
 GROUP = "femoreg_torch.commands"
+_LONGEST = 2000  # characters of a complaint
+_RANGES = {  # of options that have one meaning in all commands
+    "seed": (0, 2**31 - 1),
+    "spacing_mm": (0.3, 5),
+    "jobs": (1, 1024),
+    "count": (1, 100_000),
+    "procedures": (1, 1_000_000),
+    "devices": (1, 1024),
+    "nodes": (1, 1024),
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `femoreg` with these arguments (those of the process if None) and return its exit status.
 
     0: done; 1: a run of a study failed; 2: bad input, told in one line on stderr, or `doctor` found something amiss;
-    3: done, but not trusted; 130: interrupted. Whatever else goes wrong is a defect and keeps its traceback.
+    3: done, but not trusted; 130: interrupted. Whatever else goes wrong is a defect: it is told in one line too, with
+    status 2, and keeps its traceback where the environment has FEMOREG_TRACEBACK.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands = {command.name: command for command in entry_points(group=GROUP)}
@@ -41,26 +53,42 @@ def main(argv: Sequence[str] | None = None) -> int:
         elif arguments[0] in commands:
             return _run(commands[arguments[0]], arguments[1:])
         else:
-            raise InputError(f"no command {arguments[0]!r}; there are: {', '.join(commands)}.")
+            raise InputError(f"no command {shortened(arguments[0])}; there are: {', '.join(commands)}.")
     except InputError as error:
         return _complain(str(error))
     except ModuleNotFoundError as error:
         advice = missing_extra(error)
-        if advice is None:
-            raise
-        return _complain(advice)
+        return _tell_defect(error) if advice is None else _complain(advice)
+    except BrokenPipeError:  # whoever read the output has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it ends
+        return BAD_INPUT
     except OSError as error:
-        if error.filename is None:
-            raise
-        return _complain(f"{error.filename}: {error.strerror}.")
+        place = "a file could not be read or written" if error.filename is None else error.filename
+        return _complain(f"{place}: {error.strerror or error}.")
+    except MemoryError:
+        return _complain("the memory does not suffice. Close other programs, or crop the volumes.")
     except KeyboardInterrupt:
         _complain("interrupted.")
         return INTERRUPTED
+    except Exception as error:
+        return _tell_defect(error)
     return DONE
 
 
+def _tell_defect(error: Exception) -> int:
+    if "FEMOREG_TRACEBACK" in os.environ:
+        raise error
+    return _complain(
+        f"defect: {defect_in_one_line(error)}. Please report it, with what FEMOREG_TRACEBACK=1 makes it print."
+    )
+
+
 def _complain(message: str) -> int:
-    print(f"femoreg: {' '.join(message.split())}", file=sys.stderr)
+    """Print one line on stderr, without what could steer a terminal."""
+    line = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in " ".join(message.split()))
+    if len(line) > _LONGEST:
+        line = f"{line[: _LONGEST // 2]} … {line[-_LONGEST // 2 :]}"
+    print(f"femoreg: {line}".encode(errors="backslashreplace").decode(), file=sys.stderr)
     return BAD_INPUT
 
 
@@ -105,11 +133,13 @@ def _run(command: EntryPoint, arguments: list[str]) -> int:
 def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dict[str, Any]:
     """Keyword arguments for `function`. Raises `InputError` for what does not fit its signature."""
     from docstring_parser import parse as parse_docstring
-    from jsonargparse import ArgumentError, ArgumentParser
+    from jsonargparse import ArgumentError
+
+    from femoreg_torch.settings import plain_parser, told
 
     text = parse_docstring(function.__doc__ or "")
     help_of = {parameter.arg_name: parameter.description for parameter in text.params}
-    parser = ArgumentParser(prog=f"femoreg {name}", description=text.description, exit_on_error=False)
+    parser = plain_parser(prog=f"femoreg {name}", description=text.description)
     hints = get_type_hints(function)
     if "config" not in hints:
         parser.add_argument("--config", action="config", help="YAML file with options; the command line overrides it")
@@ -119,10 +149,12 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
         flags += getattr(annotated[parameter.name], "__metadata__", ())  # short forms, as in Annotated[int, "-n"]
         parser.add_argument(*flags, **settings, help=help_of.get(parameter.name))
     try:
-        parsed = parser.parse_args(arguments)
-    except ArgumentError as error:
-        raise InputError(f"{name}: {str(error).rstrip('. ')}. See `femoreg {name} --help`.") from error
-    values = parser.instantiate(parsed)
+        values = parser.instantiate(parser.parse_args(arguments))
+    except (ArgumentError, TypeError, ValueError, OSError) as error:  # OSError: a file of options that cannot be read
+        raise InputError(f"{name}: {told(error).rstrip('. ')}. See `femoreg {name} --help`.") from error
+    for key, (low, high) in _RANGES.items():
+        if isinstance(value := values.get(key), int | float) and not low <= value <= high:
+            raise InputError(f"{name}: --{key.replace('_', '-')}: {low:g} to {high:g} was expected, found {value:g}.")
     return {key: values[key] for key in hints if key != "return"}
 
 

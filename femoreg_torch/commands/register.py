@@ -113,9 +113,11 @@ def register_into(
     from femoreg_torch.drr import CPU
     from femoreg_torch.errors import InputError
     from femoreg_torch.evaluation import EVALUATION_NAMES, REPLAY_NAMES, evaluate
+    from femoreg_torch.files import check_new_folder
     from femoreg_torch.navigation import NAVIGATION_NAMES, navigation_content, read_robot, write_navigation
     from femoreg_torch.registration.run import network_detector, register_scene, silent
 
+    check_new_folder(out)
     case = read_case(folder)
     tool = None if case.plan is None else case.plan.tool
     calibration = None if robot is None or tool is None else read_robot(robot, tool)

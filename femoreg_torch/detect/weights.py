@@ -1,6 +1,7 @@
 """A landmark network from its weights file."""
 
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Final
 
@@ -8,8 +9,9 @@ import torch
 from torch import nn
 
 from femoreg_torch.anatomy import HIP, Anatomy, load_anatomy
+from femoreg_torch.configs import preset_names
 from femoreg_torch.drr import CPU
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.extensions import find
 from femoreg_torch.settings import read_record
 
@@ -45,6 +47,12 @@ def load_network(path: Path | None = None, device: torch.device = CPU) -> Landma
         weights = read_weights(path)
     except (OSError, ValueError) as error:
         raise InputError(str(error)) from error
+    if weights.anatomy != HIP.name and weights.anatomy not in preset_names("anatomy"):
+        raise InputError(f"{where}: no anatomy preset {shortened(weights.anatomy)}, of which it says to be.")
+    if not (isfinite(weights.sigma_px) and weights.sigma_px > 0):
+        raise InputError(f"{where}: its sigma_px, {weights.sigma_px}, is no positive number.")
+    if any(not tensor.isfinite().all() for tensor in weights.state.values() if tensor.is_floating_point()):
+        raise InputError(f"{where}: holds weights that are not finite. Train or copy it anew.")
     try:
         anatomy = HIP if weights.anatomy == HIP.name else load_anatomy(weights.anatomy)
     except InputError as error:
@@ -54,9 +62,10 @@ def load_network(path: Path | None = None, device: torch.device = CPU) -> Landma
     try:
         module = settings.build()
         module.load_state_dict(weights.state)
-    except (RuntimeError, TypeError, ValueError) as error:
+    except (RuntimeError, TypeError, ValueError, MemoryError) as error:
+        reason = " ".join(str(error).split())[:200]
         raise InputError(
-            f"{where}: the weights do not fit a network {weights.kind} of {settings} ({error})."
+            f"{where}: the weights do not fit a network {weights.kind} of {settings} ({reason})."
         ) from error
     return LandmarkNetwork(module.eval().to(device), anatomy, weights.sigma_px)
 

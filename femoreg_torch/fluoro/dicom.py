@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from femoreg_torch.arrays import check_pixels, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro.tags import Tags, read_tags
 
@@ -75,7 +76,19 @@ def read_dicom(path: Path, frames: Frames | None) -> DicomImage:
     Raises `InputError` for a file that is no DICOM image, for a cine run without `frames`, for frames that it does not
     have or whose C-arm moved, and for a colour image.
     """
+    try:
+        with quiet():
+            return _read(path, frames)
+    except InputError:
+        raise
+    except Exception as error:  # pydicom's readers and decoders raise whatever their parsing runs into
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: the DICOM file holds no image that can be decoded ({reason}).") from error
+
+
+def _read(path: Path, frames: Frames | None) -> DicomImage:
     dataset = _dataset(path)
+    check_pixels(path, int(dataset.get("Rows") or 1), int(dataset.get("Columns") or 1))
     tags = _tags(dataset, path)
     stored = _pixels(dataset, _numbers(dataset, frames, path), path)
     if stored.ndim == 3 and stored.shape[-1] == 3:
@@ -135,7 +148,7 @@ def _pixels(dataset: Any, frames: tuple[int, ...], path: Path) -> Values:
         read = [pixel_array(dataset, index=n, correct_unused_bits=packed) for n in frames]
         read = read if packed else [_stored_bits(dataset, pixels) for pixels in read]
     except (AttributeError, IndexError, KeyError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())
+        reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: the DICOM file holds no image that can be decoded ({reason}).") from error
     return read[0] if len(read) == 1 else np.mean(read, axis=0)
 

@@ -10,17 +10,20 @@ import SimpleITK as sitk
 import torch
 from torch import Tensor
 
+from femoreg_torch.arrays import MOST_PIXELS, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.fluoro.dicom import DicomImage, Frames, read_dicom
 from femoreg_torch.fluoro.tags import Tags
 from femoreg_torch.geometry import Camera
+from femoreg_torch.text import read_bytes
 from femoreg_torch.volume.itk import read_itk
 
 _ITK_SUFFIXES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
 _SCREEN_SUFFIXES = (".jpg", ".jpeg", ".bmp")  # what nobody stores intensities in
 _LOG_RANGE = (2.0, 20.0)  # of the greatest attenuation in an image: 45 cm of water at 60 keV are 9
+_MOST_PICTURE_BYTES = 2**28  # what the most pixels have as floats
 _GREY_STEPS = 12  # by which the colours of a grey JPEG may differ
 _SCREEN = (
     "is a picture of a screen: 8 bits, with a window and a curve that nobody knows. Take the DICOM file where there "
@@ -41,11 +44,16 @@ class StoredImage:
 
 
 def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+    content = np.frombuffer(read_bytes(path, _MOST_PICTURE_BYTES), np.uint8)
+    try:
+        with quiet():
+            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
+    except (cv2.error, MemoryError):  # what OpenCV does with more pixels than it was told to allow
+        image = None
     if image is None:
         raise InputError(
-            f"{path}: cannot be read as a PNG or TIFF or JPEG image; the file is damaged or something else."
+            f"{path}: cannot be read as a PNG, TIFF or JPEG image of at most {MOST_PIXELS} pixels; the file is damaged "
+            "or something else."
         )
     screen = path.suffix.lower() in _SCREEN_SUFFIXES or (path.suffix.lower() == ".png" and image.dtype == np.uint8)
     if image.ndim == 3 and image.shape[-1] in (3, 4):
@@ -86,7 +94,9 @@ def read_stored(path: Path, frames: Frames | None = None) -> StoredImage:
         raise InputError(f"{path}: `frames` are for DICOM files. Leave them out.")
     if array.ndim == 3 and array.shape[-1] in (3, 4):
         raise InputError(f"{path}: a colour image, but fluoroscopy has one value per pixel. Export it as greyscale.")
-    if array.ndim != 2:
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{path}: holds {array.dtype} values, but real numbers were expected. Export the image anew.")
+    if array.ndim != 2 or 0 in array.shape:
         raise InputError(f"{path}: one image was expected, found {' × '.join(str(n) for n in array.shape)} values.")
     image = torch.from_numpy(array.astype(np.float32))
     lowest, highest = (v.item() for v in image.aminmax())
@@ -131,7 +141,9 @@ def write_image(path: Path, image: Tensor) -> None:
     if image.dtype != torch.uint16 or image.ndim != 2 or path.suffix.lower() not in _PICTURE_SUFFIXES:
         raise InputError(f"{path}: a (H, W) uint16 image and a name in {', '.join(_PICTURE_SUFFIXES)} were expected.")
     with temporary_file(path) as part:
-        if not cv2.imwrite(str(part), image.numpy()):
+        with quiet():
+            written = cv2.imwrite(str(part), image.numpy())
+        if not written:
             raise OSError(f"{path}: the image could not be written.")
 
 

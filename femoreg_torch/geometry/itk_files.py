@@ -6,6 +6,7 @@ import SimpleITK as sitk
 import torch
 from torch import Tensor
 
+from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry.rigid import check_rigid, invert_rigid, rigid
 
@@ -16,11 +17,11 @@ def read_itk_transform(path: Path) -> Tensor:
     3D Slicer saves a transform so: under `b_from_a` a model of frame a appears in frame b. Raises `InputError` for what
     is no rigid transform in 3-D.
     """
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)  # the reason of a failure comes with the exception
     try:
-        transform = sitk.ReadTransform(str(path))
-    except RuntimeError as error:
-        reason = " ".join(str(error).split()).rpartition("): ")[2]
+        with quiet():
+            transform = sitk.ReadTransform(str(path))
+    except (RuntimeError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split()).rpartition("): ")[2][:200]
         raise InputError(f"{path}: cannot be read as an ITK transform ({reason}).") from error
     if transform.GetDimension() != 3 or not transform.IsLinear():
         raise InputError(f"{path}: a rigid transform in 3D was expected, found {transform.GetName()}.")

@@ -14,6 +14,8 @@ from femoreg_torch.errors import InputError
 
 _SMALL = 1e-2  # rad; below it the series beat the closed forms even in float32
 
+FARTHEST_MM = 1e5  # of anything in an operating theatre
+
 
 def skew(vector: Tensor) -> Tensor:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3): `skew(a) @ b == cross(a, b)`."""
@@ -165,6 +167,10 @@ def check_rigid(transform: Tensor, where: str, tolerance: float = 1e-4) -> Tenso
         raise InputError(f"{where}: a 4×4 matrix was expected, this one is {tuple(transform.shape)}.")
     if not torch.isfinite(transform).all():
         raise InputError(f"{where}: the matrix holds values that are not finite. Write it anew.")
+    if transform[:3, 3].abs().max() > FARTHEST_MM:
+        raise InputError(
+            f"{where}: moves by {transform[:3, 3].abs().max():.3g} mm, farther than any room. Is it in mm?"
+        )
     rotation = transform[:3, :3]
     bottom = transform.new_tensor([0.0, 0.0, 0.0, 1.0])
     gap = (rotation @ rotation.T - torch.eye(3, dtype=rotation.dtype)).abs().max().item()

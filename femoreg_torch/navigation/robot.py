@@ -6,8 +6,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import check_rigid, read_itk_transform, rigid
+from femoreg_torch.text import MOST_YAML_BYTES, read_bytes
 
 _LEAST_REACH_MM = 10.0  # no tool stands this close to the base of its robot: the numbers are metres
 
@@ -80,7 +81,7 @@ def _exactly_rigid(pose: Tensor) -> Tensor:
 
 def _read_text(path: Path, names: _Names) -> dict[str, Tensor]:
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_bytes(path, MOST_YAML_BYTES).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not text. Expected: {names.format}.") from error
     name = path.stem
@@ -105,5 +106,7 @@ def _row(words: list[str], where: str) -> list[float]:
     except ValueError:
         values = []
     if len(values) != 4:
-        raise InputError(f"{where}: four numbers or the name of a matrix were expected, found {' '.join(words)!r}.")
+        raise InputError(
+            f"{where}: four numbers or the name of a matrix were expected, found {shortened(' '.join(words))}."
+        )
     return values

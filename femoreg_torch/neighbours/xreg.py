@@ -22,6 +22,7 @@ import SimpleITK as sitk
 import torch
 from torch import Tensor
 
+from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import check_rigid
 from femoreg_torch.neighbours.frames import XregCamera
@@ -116,10 +117,10 @@ def read_transform(path: Path) -> Tensor:
     """The rigid matrix (4, 4) of an ITK transform file, `.h5` or `.tfm`, as it takes points. Raises `InputError`."""
     if not Path(path).is_file():
         raise InputError(f"{path}: no such file.")
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)
     try:
-        transform = sitk.ReadTransform(str(path))
-    except RuntimeError as error:
+        with quiet():
+            transform = sitk.ReadTransform(str(path))
+    except (RuntimeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as an ITK transform.") from error
     # of any linear transform: where it takes the origin and the ends of the axes
     ends = [np.array(transform.TransformPoint(tuple(point))) for point in np.vstack([np.zeros(3), np.eye(3)])]

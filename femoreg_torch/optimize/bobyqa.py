@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from femoreg_torch.optimize.result import BestSoFar, Objective, Result, Stop
+from femoreg_torch.settings import check_within
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,9 @@ class Bobyqa:
     max_evaluations: int = 300
     first_step: float = 0.25
     tol_x: float = 1e-4
+
+    def __post_init__(self) -> None:
+        check_within(self, max_evaluations=(1, 10**7), first_step=(1e-6, 1), tol_x=(0, 1))
 
     def minimise(self, objective: Objective, n: int, seed: int) -> Result:
         """Minimise over deltas (n,) in [−1, 1]ⁿ, starting from zero; returns the best point met. Nothing is random."""

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from femoreg_torch.optimize.result import BestSoFar, Objective, Result, Stop
+from femoreg_torch.settings import check_within
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,9 @@ class CmaEs:
     max_evaluations: int = 2000
     tol_x: float = 1e-3  # in initial standard deviations
     tol_f: float = 1e-5
+
+    def __post_init__(self) -> None:
+        check_within(self, population=(2, 100_000), max_evaluations=(1, 10**7), tol_x=(0, 1), tol_f=(0, 1e6))
 
     def minimise(self, objective: Objective, n: int, seed: int) -> Result:
         """Minimise over deltas (n,), starting from zero; returns the best point ever met.

@@ -6,6 +6,7 @@ import torch
 
 from femoreg_torch.optimize.quadratic import Quadratic, SmoothObjective
 from femoreg_torch.optimize.result import BestSoFar, Objective, Result, Stop
+from femoreg_torch.settings import check_within
 
 _DAMPING = 1e-3  # at the start, relative to the curvature of each degree of freedom
 _SOFTEST = 1e-4  # least curvature that counts, relative to the mean
@@ -34,6 +35,17 @@ class LevenbergMarquardt:
     candidates: int = 0
     starts: int = 1
     valley: float = 0.0  # half-length of the parabolas along the softest directions, in units of the scales; 0: none
+
+    def __post_init__(self) -> None:
+        check_within(
+            self,
+            max_iterations=(1, 10_000),
+            tol_x=(0, 1),
+            tol_f=(0, 1e6),
+            candidates=(0, 10**6),
+            starts=(1, 10_000),
+            valley=(0, 100),
+        )
 
     def minimise(self, objective: Objective, n: int, seed: int) -> Result:
         """Minimise over deltas (n,), from zero and from random starts. Evaluations count quadratics and values alike.

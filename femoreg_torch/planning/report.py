@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 import femoreg_torch
 from femoreg_torch.case import Case
+from femoreg_torch.case.fields import Fields
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json, temporary_file, write_json
 from femoreg_torch.planning.curve import Curve
@@ -120,10 +121,13 @@ def read_plan(folder: File) -> StoredPlan:
             Ellipsoid(**{field.name: float(part[field.name]) for field in dataclasses.fields(Ellipsoid)})
             for part in content["injections"]
         )
-        entry, target = (np.array(content["plan"][key], float) for key in ("entry_point", "target"))
-        loads = [float(content[key]["yield_load_n"]) for key in ("baseline", "planned")]
+        plan = Fields(content, where).mapping("plan")
+        entry, target = (plan.point(key).numpy() for key in ("entry_point", "target"))
+        loads = [Fields(content, where).mapping(key).number("yield_load_n") for key in ("baseline", "planned")]
         case = File(content["case"])
-    except (KeyError, TypeError) as error:
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{where}: is no plan of `femoreg plan` ({error} is missing or wrong).") from error
     cement = read_label_map(folder / CEMENT_NAME).data.numpy().transpose(2, 1, 0)
     return StoredPlan(case, Path(entry, target, ellipsoids), planning, loads[0], loads[1], cement.astype(float))

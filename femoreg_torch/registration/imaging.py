@@ -8,6 +8,7 @@ from torch.nn import functional as F
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera
 from femoreg_torch.registration.level import Level, binning
+from femoreg_torch.settings import check_within
 from femoreg_torch.volume import Volume
 
 _TISSUE = Level(pixel_mm=3.1, step_mm=3.0)  # how finely the soft tissue is drawn; it is smooth
@@ -24,6 +25,9 @@ class Imaging:
 
     scatter: float = 0.0
     tissue: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_within(self, scatter=(0, 10), tissue=(0, 10))
 
     def image(self, integrals: Tensor) -> Tensor:
         """What is seen of line integrals."""

@@ -8,9 +8,9 @@ from weakref import WeakKeyDictionary
 from torch import Tensor
 from torch.nn import functional as F
 
-from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import Camera
+from femoreg_torch.settings import check_within
 from femoreg_torch.volume import Volume, changes_in_place, halved
 
 _ROUNDING_MM = 1e-6
@@ -26,8 +26,7 @@ class Level:
     step_mm: float  # along the rays
 
     def __post_init__(self) -> None:
-        if not (self.pixel_mm > 0 and self.step_mm > 0):
-            raise InputError(f"level: pixel_mm and step_mm must be positive, got {self.pixel_mm} and {self.step_mm}.")
+        check_within(self, pixel_mm=(0.01, 100), step_mm=(0.05, 100))
 
     def camera(self, camera: Camera) -> Camera:
         """The camera of images at this level, given that of the images."""

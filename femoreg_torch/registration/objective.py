@@ -14,6 +14,7 @@ from femoreg_torch.registration.intrinsics import PRIOR_WEIGHT, Intrinsics
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.scene import Body, Kind, Moving, RigidObject, Scene, split
 from femoreg_torch.registration.weights import Weighting, pixel_weights, prepared
+from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import FixedSimilarity, Similarity, similarity_quadratics
 
 _STEP = 1e-5  # of a delta, for the derivatives of poses
@@ -26,6 +27,9 @@ class Prior:
     rotation_deg: float
     translation_mm: float
     weight: float
+
+    def __post_init__(self) -> None:
+        check_within(self, rotation_deg=(1e-6, 1e9), translation_mm=(1e-6, 1e9), weight=(0, 1e9))
 
 
 @dataclass(frozen=True, eq=False)

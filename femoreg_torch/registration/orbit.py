@@ -22,6 +22,7 @@ from femoreg_torch.registration.step import (
     lacking,
 )
 from femoreg_torch.registration.weights import prepared
+from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import Similarity
 
 
@@ -40,6 +41,9 @@ class OrbitSearch:
     step_deg: float
     level: Level
     similarity: Similarity
+
+    def __post_init__(self) -> None:
+        check_within(self, half_range_deg=(0, 180), step_deg=(0.01, 180))
 
     def left_out(self, scene: Scene, poses: Poses) -> str | None:
         """Why it has nothing to do, see `Step`. Raises `InputError` without the images that it needs."""

@@ -1,7 +1,7 @@
 """From a case on disk to the scene that is registered."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -47,6 +47,7 @@ from femoreg_torch.volume import (
 
 REGISTRATION_SPACING_MM = 1.0  # the paper resamples the CT to 1 mm (section III-A)
 TISSUE_SPACING_MM = 3.0  # soft tissue is smooth
+_MOST_BEYOND_MM = 500.0  # of an object's points from the box of its model: a guide may be longer than the sleeve
 SOFT_HU = 50.0  # what is above is drawn as bone
 ByKind = dict[Kind, tuple[Tensor | None, ...]]  # something (H, W) of every view
 
@@ -68,6 +69,7 @@ def prepare_scene(case: Case) -> Scene:
             check_inside(case.landmarks, ct)
             if swapped := swapped_sides(bones, case.landmarks, case.anatomy):
                 raise InputError(f"{case.folder}: {'; '.join(swapped)}.")
+            _check_path(case, ct)
             soft = resample_isotropic(ct.with_data(ct.data.clamp_max(SOFT_HU)), TISSUE_SPACING_MM)
             tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
             outline = outline_of(bones, case.anatomy)
@@ -79,6 +81,7 @@ def prepare_scene(case: Case) -> Scene:
     for name, volumes in made.items():
         thing = case.objects[name]
         assert thing.model is not None
+        _check_points(case, thing, volumes.volume)
         objects[name] = RigidObject(
             volumes.volume,
             volumes.volume.centre() if thing.reference is None else thing.reference,
@@ -90,6 +93,7 @@ def prepare_scene(case: Case) -> Scene:
     known = case.views[-1].camera_from_camera1 is not None
     identity = torch.eye(4, dtype=torch.float64)
     cameras = [identity if v.camera_from_camera1 is None else v.camera_from_camera1 for v in case.views]
+    check_starts(objects, case.carm.camera.sdd_mm, f"{case.folder}/case.yaml")
     return Scene(
         case.carm,
         {name: objects[name] for name in case.objects},
@@ -101,6 +105,41 @@ def prepare_scene(case: Case) -> Scene:
         left_on_left=tuple(view for view in range(len(case.views)) if case.display_of(view).left_on_left),
         missing=told,
     )
+
+
+def _check_path(case: Case, ct: Volume) -> None:
+    """Raises `InputError` if a path through bones of the CT leaves the CT."""
+    if case.plan is not None and case.objects[case.plan.object].model is None:
+        check_inside({"entry_point of the plan": case.plan.entry_point, "target of the plan": case.plan.target}, ct)
+
+
+def _check_points(case: Case, thing: CaseObject, volume: Volume) -> None:
+    """Raises `InputError` for a point (3,) of an object that lies nowhere near its model."""
+    named = thing.points if thing.reference is None else {**thing.points, "reference": thing.reference}
+    half = torch.tensor(volume.data.shape[::-1]) * torch.tensor(volume.spacing_mm, dtype=torch.float64) / 2
+    across = volume.lps_from_index[:3, :3] / torch.tensor(volume.spacing_mm, dtype=torch.float64)
+    for name, point in named.items():
+        beyond = ((across.T @ (point - volume.centre())).abs() - half).clamp_min(0).norm().item()
+        if beyond > _MOST_BEYOND_MM:
+            raise InputError(
+                f"{case.folder}/case.yaml, {thing.name}: its point {name} lies {beyond:.0f} mm outside its model. Are "
+                "both in mm, and in the same space?"
+            )
+
+
+def check_starts(objects: Mapping[str, RigidObject], sdd_mm: float, where: str) -> None:
+    """Raises `InputError` that starts with `where` for a nominal pose that is not between source and detector."""
+    for name, thing in objects.items():
+        pose = thing.start.camera1_from
+        if pose is None:
+            continue
+        depth = (pose[:3, :3] @ thing.reference_point + pose[:3, 3])[2].item()
+        if not 0 < depth < sdd_mm:
+            place = "behind the source" if depth <= 0 else "behind the detector"
+            raise InputError(
+                f"{where}: the start pose puts {name} {place}, {depth:.0f} mm along the beam from the source. Give the "
+                "transform from its space to camera 1, in mm, and not its inverse."
+            )
 
 
 def read_bones(case: Case) -> tuple[Volume, BoneLabels]:

@@ -16,11 +16,11 @@ from femoreg_torch.case import Case, Result, Start, StartRecord
 from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.detect import detect, load_network
 from femoreg_torch.drr import CPU
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import check_rigid
 from femoreg_torch.registration.doubts import doubts
 from femoreg_torch.registration.plan import Plan, load_plan
-from femoreg_torch.registration.prepare import prepare_scene
+from femoreg_torch.registration.prepare import check_starts, prepare_scene
 from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance, path_covariance
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.registration.start import (
@@ -179,8 +179,11 @@ def _started_at(scene: Scene, start: Mapping[str, Tensor]) -> Scene:
     objects = dict(scene.objects)
     for name, pose in start.items():
         if name not in objects:
-            raise InputError(f"start: there is no object {name!r} in this case; there are: {', '.join(objects)}.")
+            raise InputError(
+                f"start: there is no object {shortened(name)} in this case; there are: {', '.join(objects)}."
+            )
         objects[name] = replace(objects[name], start=Start(camera1_from=check_rigid(pose.double(), f"start, {name}")))
+    check_starts(objects, scene.carm.camera.sdd_mm, "start")
     return replace(scene, objects=objects)
 
 

@@ -162,7 +162,7 @@ class Scene:
                     placed[name] = where
             if len(left) == len(waiting):
                 raise InputError(
-                    f"object {left[0]}: starts beside {self.objects[left[0]].start.beside!r}, which is nowhere."
+                    f"object {left[0]}: starts beside {self.objects[left[0]].start.beside}, which is nowhere."
                 )
             waiting = left
         # in the order of the objects, whichever was placed first

@@ -29,6 +29,7 @@ from femoreg_torch.registration.step import (
     lacking,
 )
 from femoreg_torch.registration.weights import Weighting
+from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import Similarity
 
 EACH, VIEW, VIEWS, INTRINSICS = "each", "view", "views", "intrinsics"
@@ -71,6 +72,7 @@ class BodyPlan:
             raise InputError("rotation_deg and translation_mm need three numbers, one per camera axis.")
         if not self.move:
             raise InputError("a body: `move` names nothing.")
+        check_within(self, rotation_deg=(0, 180), translation_mm=(0, 5000))
 
     @property
     def is_carm(self) -> bool:

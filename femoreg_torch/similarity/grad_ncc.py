@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import cpu
 from femoreg_torch.similarity.checks import check_patches, check_size, check_weights
 from femoreg_torch.similarity.curvature import patch_curvature
@@ -35,6 +36,9 @@ class GradNcc:
 
     patch_radius: int = 5
     smoothing_px: float = 1.1
+
+    def __post_init__(self) -> None:
+        check_within(self, patch_radius=(1, 1000), smoothing_px=(0, 100))
 
     def against(self, fixed: Tensor, weights: Tensor | None = None) -> "FixedGradNcc":
         """Prepare with the fixed image (H, W); a patch weighs what its pixels' `weights` (H, W) are on average.

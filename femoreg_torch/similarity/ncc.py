@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from femoreg_torch.settings import check_within
 from femoreg_torch.similarity.checks import check_patches, check_size, check_weights
 from femoreg_torch.similarity.kernels import FLAT, patch_sums, patch_weights
 
@@ -18,6 +19,9 @@ class Ncc:
     """
 
     patch_radius: int | None = None
+
+    def __post_init__(self) -> None:
+        check_within(self, patch_radius=(1, 1000))
 
     def against(self, fixed: Tensor, weights: Tensor | None = None) -> "FixedNcc | FixedPatchNcc":
         """Prepare with the fixed image (H, W), each pixel weighted by `weights` (H, W) if given.

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.settings import check_within
 from femoreg_torch.similarity.checks import check_size, check_weights
 from femoreg_torch.similarity.kernels import away_from, derivative_taps, image_gradients
 
@@ -19,6 +20,9 @@ class GradientOrientation:
     """
 
     smoothing_px: float = 1.1  # standard deviation of a Gaussian, before Sobel
+
+    def __post_init__(self) -> None:
+        check_within(self, smoothing_px=(0, 100))
 
     def against(self, fixed: Tensor, weights: Tensor | None = None) -> "FixedGradientOrientation":
         """Prepare with the fixed image (H, W); `weights` (H, W) say where to look.

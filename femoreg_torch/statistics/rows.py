@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import temporary_file
 from femoreg_torch.statistics.quantities import AXES, METRICS, OBJECTS, PELVIS_AT_HEAD, POSE_QUANTITIES, QUANTITIES
 
@@ -63,7 +63,9 @@ def checked_rows(rows: pd.DataFrame, where: str | Path) -> pd.DataFrame:
     if not any(quantity.column in rows for quantity in QUANTITIES) and rows["status"].eq(DONE).any():
         raise InputError(f"{where}: has no error in any column, as {QUANTITIES[0].column} or {QUANTITIES[-1].column}.")
     if unknown := sorted(set(map(str, rows["status"])) - {DONE, REFUSED, FAILED}):
-        raise InputError(f"{where}: status {unknown[0]!r} is unknown; there are {DONE}, {REFUSED} and {FAILED}.")
+        raise InputError(
+            f"{where}: status {shortened(unknown[0])} is unknown; there are {DONE}, {REFUSED} and {FAILED}."
+        )
     rows = rows.copy()
     for column in [c for c in (*IDENTITY, *OUTCOME, ASKED) if c in rows and c not in _NOT_TEXT]:
         rows[column] = rows[column].astype(object).where(rows[column].notna(), "").map(_text)
@@ -99,7 +101,7 @@ def groups(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
     names = [*found, ALL] if len(found) > 1 else [*found]
     if len({folder_name(name) for name in names}) < len(names):
         raise InputError(
-            f"conditions {', '.join(found)}: two would share a folder, or use that of {ALL!r}. Rename them."
+            f"conditions {', '.join(found)}: two would share a folder, or use that of {shortened(ALL)}. Rename them."
         )
     return {ALL: rows, **found} if len(found) > 1 else found
 

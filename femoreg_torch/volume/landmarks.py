@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import read_json, write_json
+from femoreg_torch.geometry.rigid import FARTHEST_MM
+from femoreg_torch.text import MOST_JSON_BYTES, read_bytes
 from femoreg_torch.volume.grid import Volume
 
 _LPS_FROM = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
@@ -19,14 +21,14 @@ _FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
 
 
 def _signs(space: Any, where: str) -> tuple[float, float, float]:
-    if space not in _LPS_FROM:
-        raise InputError(f"{where}: the space must be LPS or RAS, found {space!r}.")
+    if not isinstance(space, str) or space not in _LPS_FROM:
+        raise InputError(f"{where}: the space must be LPS or RAS, found {shortened(space)}.")
     return _LPS_FROM[space]
 
 
 def _check_unit(unit: Any, where: str) -> None:
     if unit != "mm":
-        raise InputError(f"{where}: the unit must be mm, found {unit!r}. Convert the points.")
+        raise InputError(f"{where}: the unit must be mm, found {shortened(unit)}. Convert the points.")
 
 
 def _plain_points(content: dict[str, Any], path: Path) -> list[tuple[Any, Any, Any]]:
@@ -62,7 +64,7 @@ def _slicer_points(content: dict[str, Any], path: Path) -> list[tuple[Any, Any, 
 def _fcsv_points(path: Path) -> list[tuple[Any, Any, Any]]:
     """Without a line that tells the space it is RAS: that of 3D Slicer before 4.11, and of xReg."""
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_bytes(path, MOST_JSON_BYTES).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: cannot be read as an .fcsv file ({error}).") from error
     comments = (line.lstrip("# ").split("=", 1) for line in lines if line.startswith("#") and "=" in line)
@@ -70,17 +72,21 @@ def _fcsv_points(path: Path) -> list[tuple[Any, Any, Any]]:
     space, columns = header.get("CoordinateSystem", "RAS"), header.get("columns", _FCSV_COLUMNS).split(",")
     if missing := {"label", "x", "y", "z"} - set(columns):
         raise InputError(f"{path}: its columns lack {', '.join(sorted(missing))}. Save it anew with 3D Slicer.")
-    rows = csv.DictReader((line for line in lines if line.strip() and not line.startswith("#")), fieldnames=columns)
+    reader = csv.DictReader((line for line in lines if line.strip() and not line.startswith("#")), fieldnames=columns)
+    try:
+        rows = list(reader)
+    except csv.Error as error:
+        raise InputError(f"{path}: cannot be read as an .fcsv file ({error}).") from error
     return [(_SPACES.get(space, space), row["label"], [row["x"], row["y"], row["z"]]) for row in rows]
 
 
 def _point(value: Any, where: str) -> Tensor:
     try:
         point = torch.tensor([float(v) for v in value], dtype=torch.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         point = torch.empty(0)
-    if point.shape != (3,) or not torch.isfinite(point).all():
-        raise InputError(f"{where}: three finite numbers [x, y, z] in mm were expected, found {value!r}.")
+    if point.shape != (3,) or not torch.isfinite(point).all() or point.abs().max() > FARTHEST_MM:
+        raise InputError(f"{where}: three finite numbers [x, y, z] in mm were expected, found {shortened(value)}.")
     return point
 
 
@@ -99,7 +105,7 @@ def read_landmarks(path: Path, known: Sequence[str] | None = HIP.landmark_names)
     for label, point in _points(path):
         name = label if known is None else spelt.get(_plain_name(label), "")
         if not name:
-            raise InputError(f"{path}: unknown landmark {label[:60]!r}.{told}")
+            raise InputError(f"{path}: unknown landmark {shortened(label)}.{told}")
         if name in found:
             raise InputError(f"{path}: landmark {name} stands there twice. Keep one.")
         found[name] = point
@@ -119,7 +125,7 @@ def _points(path: Path) -> list[tuple[str, Tensor]]:
     if path.suffix.lower() == ".fcsv":
         points = _fcsv_points(path)
     else:
-        content = read_json(path)
+        content = read_json(path, with_nan=True)  # of a point that was not placed, or a measurement without a value
         points = (_slicer_points if "markups" in content else _plain_points)(content, path)
     found = []
     for space, label, value in points:

@@ -9,7 +9,7 @@ agrees with the tables within 0.3 % where both have a material.
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 
 _ENERGIES_KEV = (15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0)
 _MASS_ATTENUATION = {  # total, with coherent scattering, cm²/g
@@ -42,7 +42,9 @@ def mass_attenuation(material: str, energies_kev: Tensor) -> Tensor:
     Raises `InputError` for a material or an energy that is not in the tables.
     """
     if material not in _MASS_ATTENUATION:
-        raise InputError(f"material: {material!r} is not in the tables; there are: {', '.join(_MASS_ATTENUATION)}.")
+        raise InputError(
+            f"material: {shortened(material)} is not in the tables; there are: {', '.join(_MASS_ATTENUATION)}."
+        )
     if energies_kev.min() < LOWEST_KEV or energies_kev.max() > HIGHEST_KEV:
         raise InputError(f"energies: {LOWEST_KEV:g} to {HIGHEST_KEV:g} keV are tabulated, got {energies_kev.tolist()}.")
     x = torch.tensor(_ENERGIES_KEV, dtype=torch.float64).log()
@@ -56,7 +58,9 @@ def mass_attenuation(material: str, energies_kev: Tensor) -> Tensor:
 def material_hu(material: str) -> float:
     """HU that a CT would show of a solid material of a device, by its attenuation at 60 keV. Raises `InputError`."""
     if material not in DENSITIES:
-        raise InputError(f"material: {material!r} is unknown; there are: {', '.join(DENSITIES)}. Or give its `hu`.")
+        raise InputError(
+            f"material: {shortened(material)} is unknown; there are: {', '.join(DENSITIES)}. Or give its `hu`."
+        )
     return 1000 * (DENSITIES[material] * relative_to_water(material) - 1)
 
 

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 import torch
 
+from femoreg_torch.arrays import check_voxels
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume.attenuation import hu_to_attenuation
 from femoreg_torch.volume.grid import Volume, axis_aligned
@@ -93,9 +94,13 @@ def voxelise_mesh(mesh: "trimesh.Trimesh", spacing_mm: float, hu: float) -> Volu
 
 
 def empty_grid(bounds: np.ndarray, spacing_mm: float) -> Volume:
-    """Zeros on cubic voxels around `bounds` (2, 3), the lowest and the highest corner in mm, with a margin."""
+    """Zeros on cubic voxels around `bounds` (2, 3), the lowest and the highest corner in mm, with a margin.
+
+    Raises `InputError` for more voxels than can be worked with.
+    """
     lowest = bounds[0] - _MARGIN * spacing_mm  # outer corner of the grid
     size = np.ceil((bounds[1] - lowest) / spacing_mm).astype(int) + _MARGIN
+    check_voxels(size, "device", "It is larger than a device: crop the model, or check its unit.")
     x, y, z = (lowest + 0.5 * spacing_mm).tolist()
     return Volume(torch.zeros(*size[::-1].tolist()), axis_aligned((spacing_mm, spacing_mm, spacing_mm), (x, y, z)))
 

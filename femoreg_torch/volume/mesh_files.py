@@ -1,17 +1,21 @@
 """Files of CAD meshes: one surface, or several bodies with names. What is read is in mm."""
 
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume.mesh import check_closed
 
 if TYPE_CHECKING:
     import trimesh
 
+_SUFFIXES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb")
+_MOST_UNZIPPED = 2**29  # bytes of all that a 3MF file holds
 _SHORTEST_MM, _LONGEST_MM = 5.0, 2000.0  # of a device; beyond them the file is likely in metres, inches or µm
 
 
@@ -79,13 +83,38 @@ def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, tri
         raise InputError(f"{path}: no such file.")
     if path.suffix.lower() in (".step", ".stp"):
         raise InputError(f"{path}: is a STEP file. Export it as STL, or as 3MF if it has several bodies.")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise InputError(f"{path}: a mesh ({', '.join(_SUFFIXES)}) was expected.")
     options: dict[str, Any] = {}
     if path.suffix.lower() == ".obj":
         options = {"split_objects": split_objects, "split_groups": split_groups, "group_material": False}
     try:
-        scene = trimesh.load_scene(path, process=False, **options)
+        with quiet():
+            _check_unzipped(path)
+            bodies = _bodies(trimesh.load_scene(path, process=False, **options), path)
+    except InputError:
+        raise
     except Exception as error:  # trimesh's readers raise whatever their parsing runs into
-        raise InputError(f"{path}: cannot be read as a mesh (STL, PLY, OBJ, OFF, 3MF or GLB): {error}.") from error
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise InputError(f"{path}: cannot be read as a mesh (STL, PLY, OBJ, OFF, 3MF or GLB): {reason}.") from error
+    if not bodies:
+        raise InputError(f"{path}: the mesh holds no triangle.")
+    return bodies
+
+
+def _check_unzipped(path: Path) -> None:
+    """Raises `InputError` for a 3MF file, which is a zip archive, that would grow beyond any device."""
+    if path.suffix.lower() == ".3mf":
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > _MOST_UNZIPPED:
+            raise InputError(f"{path}: unpacks to {size / 2**20:.0f} MB, which no device has. Export it coarser.")
+
+
+def _bodies(scene: "trimesh.Scene", path: Path) -> "dict[str, trimesh.Trimesh]":
+    """The surfaces of a scene by name, in mm, equal vertices merged."""
+    import trimesh
+
     mm = 1.0 if scene.units is None else trimesh.units.unit_conversion(scene.units, "mm")
     bodies = {}
     for name in sorted(scene.graph.nodes_geometry):
@@ -93,11 +122,11 @@ def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, tri
         surface = scene.geometry[geometry]
         if not isinstance(surface, trimesh.Trimesh):
             raise InputError(f"{path}: triangle meshes were expected, found {type(surface).__name__}.")
+        if len(surface.faces) and (surface.faces.min() < 0 or surface.faces.max() >= len(surface.vertices)):
+            raise InputError(f"{path}: a triangle has a corner that is not in the file. Export it anew.")
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
         mesh.apply_transform(place)
         mesh.apply_scale(mm)
         mesh.merge_vertices()
         bodies[name] = mesh
-    if not bodies:
-        raise InputError(f"{path}: the mesh holds no triangle.")
     return bodies

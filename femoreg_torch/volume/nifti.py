@@ -3,12 +3,12 @@
 It turns the first into zero, which as HU would be water, and fills the second up with zeros.
 """
 
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from femoreg_torch.arrays import check_claim, quiet
 from femoreg_torch.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,14 +27,22 @@ def check_nifti(path: Path) -> None:
     import nibabel  # takes a tenth of a second, beside the reading of images
 
     try:
-        image: Any = nibabel.load(path)  # its declared type is that of all formats, without voxels
-        integers = image.get_data_dtype().kind not in "fc"
-        # Integers are all finite. To decompress them only to see that none is missing would double the time to read.
-        if integers and path.suffix.lower() == ".gz" and _whole(path, image.dataobj):
-            return
-        values = np.asanyarray(image.dataobj.get_unscaled())
-    except (nibabel.filebasedimages.ImageFileError, OSError, EOFError, ValueError, zlib.error) as error:
-        reason = " ".join(str(error).replace(str(path), "it").split()).rstrip(".")
+        with quiet():
+            image: Any = nibabel.load(path)  # its declared type is that of all formats, without voxels
+            kind = image.get_data_dtype()
+            there = None if path.name.lower().endswith((".hdr", ".img", ".img.gz")) else path.stat().st_size
+            if not np.isfinite(image.affine).all():
+                raise InputError(f"{path}: its origin or its axes are not finite. Export it anew.")
+            check_claim(path, image.shape, kind.itemsize, there)
+            # Integers are all finite. To decompress them only to see that none is missing would double the time to
+            # read.
+            if kind.kind not in "fc" and path.suffix.lower() == ".gz" and _whole(path, image.dataobj):
+                return
+            values = np.asanyarray(image.dataobj.get_unscaled())
+    except InputError:
+        raise
+    except Exception as error:  # nibabel's readers raise whatever their parsing runs into
+        reason = " ".join(str(error).replace(str(path), "it").split()).rstrip(".")[:200]
         raise InputError(f"{path}: cannot be read as NIfTI ({reason}). Export or download it anew.") from error
     if values.dtype.kind in "fc" and not np.isfinite(values).all():
         raise InputError(f"{path}: holds values that are not finite (NaN or infinite). Repair or export it anew.")

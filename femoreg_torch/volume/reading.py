@@ -9,14 +9,17 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy.tables import LARGEST_ID
+from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
+from femoreg_torch.geometry.rigid import FARTHEST_MM
 from femoreg_torch.volume.dicom import choose_series, is_dicom, read_series
 from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.itk import read_itk
 from femoreg_torch.volume.segments import has_names, read_segments
 
 _LEAST_INSIDE = 0.98  # of what a label map labels, less than this within the CT is told
+_FINEST_MM, _COARSEST_MM = 0.01, 50.0  # voxels: of a micro-CT, and more than those of any clinical scan
 _FAT_HU, _BONE_HU = -50, 200  # every CT of a hip holds something below the first and something above the second
 
 
@@ -24,10 +27,16 @@ def _read(path: Path, series: str | None = None) -> tuple[sitk.Image, tuple[str,
     """The stored volume, and what had to be done to it in words. Raises `InputError`."""
     if not path.exists():
         raise InputError(f"{path}: no such file or folder.")
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)  # the reason of a failure comes with the exception
-    if path.is_dir() or is_dicom(path):
-        return read_series(choose_series(path, series))
-    return read_itk(path), ()
+    if not (path.is_dir() or is_dicom(path)):
+        return read_itk(path), ()
+    try:
+        with quiet():
+            return read_series(choose_series(path, series))
+    except InputError:
+        raise
+    except Exception as error:  # pydicom's and GDCM's readers raise whatever their parsing runs into
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: the DICOM series cannot be read ({reason}). Export it anew.") from error
 
 
 def _oriented(image: sitk.Image, path: Path) -> sitk.Image:
@@ -44,6 +53,14 @@ def _oriented(image: sitk.Image, path: Path) -> sitk.Image:
             f"{path}: a 3-D volume of one channel was expected, found {size} voxels of "
             f"{image.GetNumberOfComponentsPerPixel()} channel(s)."
         )
+    spacing = image.GetSpacing()
+    if not (min(spacing) >= _FINEST_MM and max(spacing) <= _COARSEST_MM):
+        told = " × ".join(f"{s:.3g}" for s in spacing)
+        raise InputError(
+            f"{path}: voxels of {told} mm were found, {_FINEST_MM:g} to {_COARSEST_MM:g} mm expected. Is it in mm?"
+        )
+    if max(map(abs, image.GetOrigin())) > FARTHEST_MM:
+        raise InputError(f"{path}: its origin lies {max(map(abs, image.GetOrigin())):.3g} mm away. Export it anew.")
     return sitk.DICOMOrient(image, "LPS")
 
 
@@ -158,12 +175,20 @@ def read_labels_told(path: Path, like: Volume, ids: Collection[int] | None = Non
 
 
 def write_volume(path: Path, volume: Volume) -> None:
-    """Write a volume; the suffix chooses the format (.nii.gz, .nrrd, .mha). HU (float) are stored as whole numbers."""
+    """Write a volume; the suffix chooses the format (.nii.gz, .nrrd, .mha). HU (float) are stored as whole numbers.
+
+    Raises `OSError` that names the file if it cannot be written.
+    """
     if volume.data.dtype.is_floating_point:
         volume = volume.with_data(volume.data.round().clamp(-32768, 32767).to(torch.int16))
     image = _image(volume)
     with temporary_file(Path(path)) as part:
-        sitk.WriteImage(image, str(part), useCompression=True)
+        try:
+            with quiet():
+                sitk.WriteImage(image, str(part), useCompression=True)
+        except RuntimeError as error:
+            reason = (str(error).strip().splitlines() or ["unknown reason"])[-1][:200]
+            raise OSError(f"{path}: cannot be written ({reason}).") from error
 
 
 def _image(volume: Volume) -> sitk.Image:

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from femoreg_torch.arrays import check_voxels
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume.grid import Volume
 
@@ -45,7 +46,8 @@ def resample_isotropic(volume: Volume, spacing_mm: float, nearest: bool = False)
     """The volume on cubic voxels of `spacing_mm`, along its own axes.
 
     The outer face of the first voxel stays in place; a voxel that would reach beyond the far face is left out. Linear
-    interpolation, with averaging where voxels become larger; `nearest` is for label maps.
+    interpolation, with averaging where voxels become larger; `nearest` is for label maps. Raises `InputError` if the
+    new voxels are larger than the volume, or more than can be worked with.
     """
     old = volume.spacing_mm
     if all(abs(s - spacing_mm) < 1e-6 for s in old):
@@ -54,6 +56,9 @@ def resample_isotropic(volume: Volume, spacing_mm: float, nearest: bool = False)
     scale = tuple((s + 1e-9) / spacing_mm for s in old)
     if any(int(n * s) < 1 for n, s in zip(reversed(volume.data.shape), scale, strict=True)):
         raise InputError(f"volume: {spacing_mm:g} mm voxels are larger than the whole volume.")
+    size = [int(n * s) for n, s in zip(reversed(volume.data.shape), scale, strict=True)]
+    extent = " × ".join(f"{n * s:.0f}" for n, s in zip(reversed(volume.data.shape), old, strict=True))
+    check_voxels(size, f"volume of {extent} mm on voxels of {spacing_mm:g} mm", "Check its spacing, or crop it.")
     affine = volume.lps_from_index.clone()
     affine[:3, 3] += affine[:3, :3] @ (0.5 * ratio - 0.5)
     affine[:3, :3] *= ratio

@@ -23,7 +23,8 @@ import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.arrays import quiet
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.volume.dicom import image_of, is_dicom, series_in
 from femoreg_torch.volume.itk import read_itk
 
@@ -184,12 +185,12 @@ def _nifti_segments(path: Path) -> list[Segment]:
 def _slicer_segments(path: Path) -> list[Segment]:
     reader = sitk.ImageFileReader()
     reader.SetFileName(str(path))
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)  # the reason of a failure comes with the exception
     try:
-        reader.ReadImageInformation()
-    except RuntimeError as error:
+        with quiet():
+            reader.ReadImageInformation()
+            fields = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
+    except (RuntimeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read; a segmentation of 3D Slicer (.seg.nrrd) was expected.") from error
-    fields = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
     numbers = sorted(int(match[1]) for match in map(_NAME.fullmatch, fields) if match)
     if not numbers:
         raise InputError(
@@ -212,9 +213,9 @@ def _slicer_segments(path: Path) -> list[Segment]:
 
 def _whole(fields: dict[str, str], key: str, least: int, path: Path, otherwise: str = "") -> int:
     text = fields.get(key, otherwise)
-    if not text.strip().isdecimal() or int(text) < least:
+    if not (text.strip().isdecimal() and len(text.strip()) < 10 and int(text) >= least):
         raise InputError(
-            f"{path}, {key}: a whole number from {least} was expected, found {text[:20]!r}. Save it anew with "
+            f"{path}, {key}: a whole number from {least} was expected, found {shortened(text, 20)}. Save it anew with "
             "3D Slicer 4.11 or later."
         )
     return int(text)

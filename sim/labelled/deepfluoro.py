@@ -29,7 +29,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.fluoro import attenuation_image
 from femoreg_torch.geometry import Camera, load_carm
-from femoreg_torch.settings import read_record
+from femoreg_torch.settings import SEEDS, check_within, read_record
 from sim.labelled.devices_in_view import make_devices
 from sim.labelled.imaged_patient import ImagedPatient, prepare_patient, read_imaged_patient
 from sim.labelled.physics_views import render_physics
@@ -50,6 +50,9 @@ class Cohort:
     views: int  # of each patient
     seed: int
 
+    def __post_init__(self) -> None:
+        check_within(self, seeds=SEEDS, spacing_mm=(0.3, 5), views=(1, 100_000), seed=SEEDS)
+
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetSettings(LabelledSettings):
@@ -67,13 +70,18 @@ def deepfluoro_camera(camera: Camera, factor: int) -> Camera:
     return camera.window(*spans)
 
 
+def load_dataset_settings(config: str | Path) -> DatasetSettings:
+    """Settings of a preset in `configs/simulation/` or of a YAML file. Raises `InputError` that names the key."""
+    return read_record(DatasetSettings, load_preset("simulation", config), f"labelled images {config}")
+
+
 def write_dataset(config: str, out: Path, report: Callable[[str], None]) -> None:
     """Render the data set of a preset or YAML file into the HDF5 file `out`, whole or not at all.
 
     `report` is told each patient before it is imaged. Raises `InputError` for settings that do not fit.
     """
     where = f"labelled images {config}"
-    settings = read_record(DatasetSettings, load_preset("simulation", config), where)
+    settings = load_dataset_settings(config)
     cohort = settings.patients
     camera = deepfluoro_camera(load_carm(settings.carm).camera, settings.image.binning)
     sources: list[tuple[str, Callable[[], ImagedPatient]]] = [

@@ -21,13 +21,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
-from femoreg_torch.geometry import Camera, load_carm
+from femoreg_torch.geometry import Camera, carm_from_dict, load_carm
+from femoreg_torch.tensors import check_shapes, read_metadata, read_tensors, write_tensors
+from femoreg_torch.text import json_content
 from femoreg_torch.volume import resample_isotropic
 from sim.labelled.devices_in_view import make_devices
 from sim.labelled.imaged_patient import ImagedPatient, read_imaged_patient
@@ -37,19 +38,19 @@ from sim.labelled.view_poses import FEMORAL_HEADS
 from sim.physics.fluoroscopy import XrayModel
 
 _HIPS_MM = 2.5  # voxels of the hip bones that are kept with the images
-_TENSORS = (
-    "images",
-    "labels",
-    "landmarks",
-    "landmarks_lps",
-    "camera_from_lps",
-    "camera_from_femur",
-    "device",
-    "one_hip",
-    "hips",
-    "lps_from_hips",
-    "xray",
-)
+_TENSORS: dict[str, tuple[str | int, ...]] = {  # and their shapes
+    "images": ("N", "H", "W"),
+    "labels": ("N", "h", "w"),
+    "landmarks": ("N", len(HIP.landmarks), 2),
+    "landmarks_lps": (len(HIP.landmarks), 3),
+    "camera_from_lps": ("N", 4, 4),
+    "camera_from_femur": ("N", 2, 4, 4),
+    "device": ("N",),
+    "one_hip": ("N",),
+    "hips": ("D", "E", "F"),
+    "lps_from_hips": (4, 4),
+    "xray": ("N", "K"),
+}
 
 
 @dataclass(frozen=True)
@@ -134,20 +135,25 @@ def write_labelled(path: Path, content: LabelledImages) -> None:
         "xray": json.dumps(content.xray_names),
     }
     with temporary_file(path) as part:
-        save_file({name: getattr(content, name).contiguous() for name in _TENSORS}, part, metadata=metadata)
+        write_tensors(part, {name: getattr(content, name).contiguous() for name in _TENSORS}, metadata)
 
 
 def read_labelled(path: Path) -> LabelledImages:
     """What `write_labelled` wrote. Raises `InputError` if there is no such file, or it is something else."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
-    with safe_open(path, "pt") as file:
-        metadata = file.metadata() or {}
-        if not {"source", "camera", "xray"} <= set(metadata):
-            raise InputError(f"{path}: does not hold labelled images; make them with `femoreg labelled-images`.")
-        tensors = {name: file.get_tensor(name) for name in _TENSORS}
-    known = json.loads(metadata["camera"])
-    camera = Camera(known["sdd_mm"], *(tuple(known[key]) for key in ("pixel_mm", "shape", "principal_point_px")))
+    metadata = read_metadata(path)
+    if not {"source", "camera", "xray"} <= set(metadata):
+        raise InputError(f"{path}: does not hold labelled images; make them with `femoreg labelled-images`.")
+    _, tensors = read_tensors(path, tuple(_TENSORS))
+    check_shapes(tensors, _TENSORS, str(path))
+    camera = carm_from_dict(json_content(metadata["camera"], f"{path}, camera"), f"{path}, camera").camera
+    if tuple(tensors["images"].shape[1:]) != camera.shape or tensors["images"].dtype != torch.uint16:
+        raise InputError(f"{path}, images: 16-bit images of the camera's {camera.shape} pixels were expected.")
+    for name in ("camera_from_lps", "lps_from_hips"):
+        if tensors[name].dtype != torch.float64:
+            raise InputError(f"{path}, {name}: float64 was expected, found {tensors[name].dtype}.")
     return LabelledImages(
-        **tensors, xray_names=tuple(json.loads(metadata["xray"])), camera=camera, source=metadata["source"]
+        **tensors,
+        xray_names=tuple(json_content(metadata["xray"], f"{path}, xray")),
+        camera=camera,
+        source=metadata["source"],
     )

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from femoreg_torch.configs import load_preset
 
-from femoreg_torch.settings import read_record
+from femoreg_torch.settings import check_rising, check_within, read_record
 from sim.labelled.view_poses import ViewRanges
-from sim.physics.fluoroscopy import XrayModel
+from sim.physics.fluoroscopy import XRAY_RANGES, XrayModel
 
 Range = float | tuple[float, float]  # a value, or low and high
 
@@ -24,6 +24,18 @@ class DeviceRanges:
     depth_mm: tuple[float, float]  # source to its middle
     shift_mm: float  # of its middle from the central ray, across and along
     angle_deg: float  # out of the plane of the detector; in that plane it points anywhere
+
+    def __post_init__(self) -> None:
+        check_within(
+            self,
+            share=(0, 1),
+            count=(0, 1000),
+            hu=(-1000, 100_000),
+            depth_mm=(50, 2500),
+            shift_mm=(0, 1000),
+            angle_deg=(0, 180),
+        )
+        check_rising(self, "depth_mm")
 
 
 @dataclass(frozen=True)
@@ -50,6 +62,10 @@ class XrayRanges:
     gain_spread: Range
     open_beam_counts: Range
 
+    def __post_init__(self) -> None:
+        check_within(self, **XRAY_RANGES)
+        check_rising(self, *XRAY_RANGES)
+
     def draw(self, rng: np.random.Generator) -> XrayModel:
         """The tube and the detector of one view."""
         drawn: dict[str, Any] = {}
@@ -70,6 +86,9 @@ class ImageGrid:
 
     binning: int  # pixels of the detector in one of the image, along each side
     step_mm: float  # of the line integrals
+
+    def __post_init__(self) -> None:
+        check_within(self, binning=(1, 64), step_mm=(0.05, 20))
 
 
 @dataclass(frozen=True, kw_only=True)

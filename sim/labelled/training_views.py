@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.drr import project
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera, project_points, transform_points
+from femoreg_torch.tensors import write_tensors
 from femoreg_torch.volume import Volume
 from sim.labelled.attenuation_layers import Layers
 from sim.labelled.class_images import class_image, left_is_nearer
@@ -75,4 +75,4 @@ def write_views(
         "landmarks": torch.stack([view.landmarks for view in views]),
     }
     with temporary_file(path) as part:
-        save_file(content, part, metadata={"source": source})
+        write_tensors(part, content, {"source": source})

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.geometry import about_point, exp_so3, rigid
+from femoreg_torch.settings import check_rising, check_within
 
 # which landmark is the head of a femur
 FEMORAL_HEADS = {f"femur_{side}": HIP.landmark_names.index(f"FH-{side[0]}") for side in ("left", "right")}
@@ -34,6 +35,24 @@ class ViewRanges:
     hip_rotation_deg: tuple[float, float, float] = (20.0, 12.0, 25.0)  # flexion, abduction, internal rotation
     size: float = 0.10  # change of all lengths
     stretch: float = 0.06  # change of single axes, and shear
+
+    def __post_init__(self) -> None:
+        check_within(
+            self,
+            orbital_deg=(0, 180),
+            cranio_caudal_deg=(0, 180),
+            in_plane_deg=(0, 180),
+            depth_mm=(100, 2500),
+            shift_mm=(0, 500),
+            one_hip_share=(0, 1),
+            cranial_share=(0, 1),
+            cranial_mm=(-500, 500),
+            posterior_share=(0, 1),
+            hip_rotation_deg=(0, 180),
+            size=(0, 0.5),
+            stretch=(0, 0.5),
+        )
+        check_rising(self, "depth_mm", "cranial_mm")
 
 
 @dataclass(frozen=True)

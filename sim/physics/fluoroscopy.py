@@ -14,12 +14,32 @@ from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.geometry import Camera
+from femoreg_torch.settings import check_within
 from femoreg_torch.volume.materials import mass_attenuation
 from sim.physics.beam import open_beam, shutter
 from sim.physics.detector import digitise, gain_pattern, motion_blur, record_quanta, veiling_glare, vignetting
 from sim.physics.spectrum import fluence, tungsten_spectrum
 
 _ROWS = 32  # of an image at a time, which stay in the processor's cache for all energies
+
+
+XRAY_RANGES: dict[str, tuple[float, float]] = {  # of what a C-arm can do, and more
+    "kvp": (20, 100),  # the tables of attenuation end there
+    "aluminium_mm": (0, 100),
+    "energy_bins": (1, 200),
+    "k_lines": (0, 10),
+    "dose_ugy": (1e-3, 1e6),
+    "quantum_efficiency": (0.01, 1),
+    "heel": (-1, 1),
+    "collimator_mm": (0, 2000),
+    "scatter": (0, 10),
+    "scatter_sigma_mm": (0, 500),
+    "motion_mm": (0, 50),
+    "blur_sigma_mm": (0, 20),
+    "electronic_noise": (0, 1e6),
+    "gain_spread": (0, 1),
+    "open_beam_counts": (10, 1e7),
+}
 
 
 @dataclass(frozen=True)
@@ -48,6 +68,18 @@ class XrayModel:
     glare: float = 0.0  # share of the light that is spread widely
     glare_mm: float = 0.0  # how wide, on the detector
     vignetting: float = 0.0  # share of the light lost at the middle of the detector's edges
+
+    def __post_init__(self) -> None:
+        check_within(
+            self,
+            **XRAY_RANGES,
+            shutter_width_mm=(0, 2000),
+            shutter_height_mm=(0, 2000),
+            shutter_deg=(-360, 360),
+            glare=(0, 1),
+            glare_mm=(0, 500),
+            vignetting=(0, 1),
+        )
 
 
 def transmission(areal: Mapping[str, Tensor], model: XrayModel) -> Tensor:

@@ -43,7 +43,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import errors
 from femoreg_torch.files import read_json, temporary_file, write_json, write_text
 from femoreg_torch.geometry import Poses, project_points, transform_points
-from femoreg_torch.settings import read_record
+from femoreg_torch.settings import SEEDS, check_within, read_record
 from femoreg_torch.statistics.formats import pipe_table, plus_minus
 from femoreg_torch.statistics.quantities import METRICS, PAPER_TRIALS
 from femoreg_torch.volume import Volume, read_ct, read_mesh, write_landmarks, write_volume
@@ -73,6 +73,9 @@ class FemurBeads:
     diameter_mm: float
     seed: int
 
+    def __post_init__(self) -> None:
+        check_within(self, near_head=(0, 100), near_entry_point=(0, 100), diameter_mm=(0.1, 20), seed=SEEDS)
+
 
 @dataclass(frozen=True)
 class DeviceBeads:
@@ -82,6 +85,9 @@ class DeviceBeads:
     diameter_mm: float
     noise_mm: float
 
+    def __post_init__(self) -> None:
+        check_within(self, count=(1, 100), diameter_mm=(0.1, 20), noise_mm=(0, 10))
+
 
 @dataclass(frozen=True)
 class ByHand:
@@ -90,6 +96,9 @@ class ByHand:
     name: str
     image_noise_px: float
     bead_noise_mm: float
+
+    def __post_init__(self) -> None:
+        check_within(self, image_noise_px=(0, 100), bead_noise_mm=(0, 10))
 
 
 @dataclass(frozen=True)

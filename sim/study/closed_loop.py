@@ -22,7 +22,7 @@ from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.files import plain
 from femoreg_torch.geometry import Poses, about_point, exp_so3, rigid, transform_points
 from femoreg_torch.navigation import guide
-from femoreg_torch.settings import read_record
+from femoreg_torch.settings import check_within, read_record
 from sim.study.conditions import Body, Condition, image_views, make_case, simulation_of, write_told
 from sim.study.procedures import Procedure
 from sim.study.record import Record, outcome
@@ -39,6 +39,9 @@ class ClosedLoop:
     rounds: int
     robot_deg: float  # standard deviation of the robot's own error: of a turn about each axis at the tip of the guide
     robot_mm: float  # and of a shift along each
+
+    def __post_init__(self) -> None:
+        check_within(self, rounds=(0, 100), robot_deg=(0, 180), robot_mm=(0, 500))
 
 
 Register = Callable[[Path, dict[str, Tensor] | None], tuple[Record, Result | None]]  # of a case folder, start poses

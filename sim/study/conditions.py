@@ -19,11 +19,11 @@ from torch import Tensor
 from femoreg_torch.case import new_folder
 from femoreg_torch.case.femoroplasty import DEVICE
 from femoreg_torch.case.model import Case
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import plain, read_json, temporary_file, write_json
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera
-from femoreg_torch.settings import read_record
+from femoreg_torch.settings import check_within, read_record
 from femoreg_torch.volume import Volume, read_ct, read_labels, read_mesh
 from sim.patient import Patient, make_scans
 from sim.study.cases import PROCEDURAL_IMAGED_MM, REAL_IMAGED_MM, REGISTERED_MM, Stores, subject_folder
@@ -57,6 +57,9 @@ class Told:
     binned: int = 1  # so many rows and columns of the images averaged into one
     fault: str | None = None  # what is wrong with the case: a name of `sim.study.faults`
 
+    def __post_init__(self) -> None:
+        check_within(self, sdd=(0.1, 10), principal_point_px=(-5000, 5000), binned=(1, 64))
+
 
 @dataclass(frozen=True)
 class Condition:
@@ -84,7 +87,9 @@ class Imaged:
 def check_faults(condition: Condition, where: str) -> None:
     """Raises `InputError` if the cases of a condition are to be wrong in a way that is not known."""
     if condition.told.fault not in (None, *FAULTS):
-        raise InputError(f"{where}: there is no fault {condition.told.fault!r}; there are: {', '.join(FAULTS)}.")
+        raise InputError(
+            f"{where}: there is no fault {shortened(condition.told.fault)}; there are: {', '.join(FAULTS)}."
+        )
 
 
 def make_conditions(

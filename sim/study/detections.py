@@ -11,6 +11,7 @@ from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import Detection, LandmarkNetwork, detect
 from femoreg_torch.geometry import Camera, project_points, transform_points
 from femoreg_torch.registration.start import Detector
+from femoreg_torch.settings import check_within
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,9 @@ class DetectionNoise:
     mean_error_mm: float  # on the detector, of the found ones that are not gross outliers
     missing: float  # share of the landmarks in the image
     gross: float  # share of the found ones that lie anywhere in the image
+
+    def __post_init__(self) -> None:
+        check_within(self, mean_error_mm=(0, 100), missing=(0, 1), gross=(0, 1))
 
 
 def draw_landmarks(

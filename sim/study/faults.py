@@ -23,6 +23,7 @@ from femoreg_torch.anatomy import HIP, label_table
 from femoreg_torch.case.femoroplasty import DEVICE, femoral_head, operated_femur
 from femoreg_torch.files import read_json, write_json, write_text
 from femoreg_torch.geometry import about_point, exp_so3, rigid, transform_points
+from femoreg_torch.text import read_yaml
 from femoreg_torch.volume import Volume, read_ct, read_labels, read_landmarks, read_mesh, write_landmarks, write_volume
 from sim.patient import make_patient, write_patient
 
@@ -162,8 +163,7 @@ FAULTS: dict[str, Callable[[Path], None]] = {
 
 def read_case_file(folder: Path) -> dict[str, Any]:
     """The content of the case.yaml in a folder."""
-    content: dict[str, Any] = yaml.safe_load((folder / "case.yaml").read_text(encoding="utf-8"))
-    return content
+    return read_yaml(folder / "case.yaml")
 
 
 def write_case_file(folder: Path, content: dict[str, Any]) -> None:

@@ -9,6 +9,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.geometry import transform_points
+from femoreg_torch.settings import check_within
 from femoreg_torch.volume import Volume, crop, read_ct, read_labels, write_volume
 
 
@@ -21,6 +22,11 @@ class ImperfectCt:
     hu_scale: float = 1.0
     grow_voxels: int = 0  # of every bone's labels, into what has none; negative: they shrink
     cut_mm: float | None = None  # the scan ends so far below the head of the operated femur
+
+    def __post_init__(self) -> None:
+        check_within(
+            self, slice_mm=(0.1, 50), blur_mm=(0, 50), hu_scale=(0.01, 100), grow_voxels=(-50, 50), cut_mm=(-500, 1000)
+        )
 
 
 def spoil_ct(folder: Path, head: Tensor, change: ImperfectCt) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from femoreg_torch.configs import load_preset
 
 from femoreg_torch.case.model import Side
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.settings import read_record
 from sim.study.closed_loop import ClosedLoop
 from sim.study.conditions import Condition, check_faults
@@ -94,9 +94,9 @@ def _problems(protocol: Protocol) -> Iterator[str]:
         yield "vary: at least one condition was expected."
     for name in names:
         if not _NAME.fullmatch(name):
-            yield f"vary: {name!r} is to be part of file names. Use letters, digits and _."
+            yield f"vary: {shortened(name)} is to be part of file names. Use letters, digits and _."
         if names.count(name) > 1:
-            yield f"vary: {names.count(name)} conditions are called {name!r}. Rename them."
+            yield f"vary: {names.count(name)} conditions are called {shortened(name)}. Rename them."
     if protocol.cohort is not None and protocol.subjects:
         yield "subjects: stand in `cohort` where there is one."
     if protocol.procedures < 1:

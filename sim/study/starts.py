@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from femoreg_torch.geometry import about_point, exp_so3, rigid, transform_points
+from femoreg_torch.settings import check_within
 
 
 @dataclass(frozen=True)
@@ -16,6 +17,9 @@ class Offset:
     rotation_deg: float
     depth_mm: float
     lateral_mm: float
+
+    def __post_init__(self) -> None:
+        check_within(self, rotation_deg=(-180, 180), depth_mm=(-2000, 2000), lateral_mm=(-1000, 1000))
 
 
 def displaced(camera1_from_pelvis: Tensor, centre: Tensor, by: Offset, generator: torch.Generator) -> Tensor:

@@ -20,7 +20,7 @@ from femoreg_torch.case.femoroplasty import (
     with_device,
 )
 from femoreg_torch.case.model import Model, PlannedPath, Side, Start
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import load_carm
 from femoreg_torch.volume import check_inside, read_ct, read_labels, read_landmarks, read_mesh
@@ -56,7 +56,7 @@ def read_preoperative(folder: Path, side: Side, seed: int, settings: Simulation,
     """
     folder = Path(folder)
     if side not in get_args(Side):
-        raise InputError(f"side: `left` or `right` was expected, got {side!r}.")
+        raise InputError(f"side: `left` or `right` was expected, got {shortened(side)}.")
     case = read_case(folder) if (folder / "case.yaml").is_file() else _bare(folder)
     ct_path, labels_path = case.ct_path, case.labels_path
     if ct_path is None or labels_path is None:

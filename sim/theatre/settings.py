@@ -10,8 +10,9 @@ from femoreg_torch.configs import load_preset
 from torch import Tensor
 from torch.nn import functional as F
 
+from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import exp_so3, rigid
-from femoreg_torch.settings import read_record
+from femoreg_torch.settings import check_within, read_record
 from sim.physics.fluoroscopy import XrayModel
 
 
@@ -21,6 +22,9 @@ class Motion:
 
     angle_deg: float
     shift_mm: float
+
+    def __post_init__(self) -> None:
+        check_within(self, angle_deg=(0, 180), shift_mm=(0, 500))
 
     def draw(self, generator: torch.Generator) -> Tensor:
         """One motion (4, 4); axis and direction are uniform on the sphere."""
@@ -49,6 +53,23 @@ class Acquisition:
     table_parts: bool = False
     moved_deg: float = 0.0
     moved_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.orbit_deg) <= 100:
+            raise InputError(f"orbit_deg: 1 to 100 views were expected, found {len(self.orbit_deg)}.")
+        check_within(
+            self,
+            head_depth_mm=(100, 2500),
+            head_lateral_mm=(-500, 500),
+            head_caudal_mm=(-500, 500),
+            orbit_deg=(-360, 360),
+            device_hu=(-1000, 100_000),
+            device_depth_mm=(50, 2500),
+            device_margin_mm=(0, 200),
+            step_mm=(0.05, 20),
+            moved_deg=(0, 180),
+            moved_mm=(0, 500),
+        )
 
 
 @dataclass(frozen=True)

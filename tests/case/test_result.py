@@ -180,7 +180,7 @@ SCALED = [[2.0, 0, 0, 0], [0, 2.0, 0, 0], [0, 0, 2.0, 0], [0, 0, 0, 1]]
         ({"quality": {"femur": 1}}, r"quality\.femur: a mapping"),
         ({"stages": 4}, r"stages: a list"),
         ({"camera_from_sacrum": [SCALED]}, r"One entry `camera_from_…` was expected, found 2"),
-        ({"seed": "a"}, r"seed: a number"),
+        ({"seed": "a"}, r"seed: a whole number"),
     ],
 )
 def test_bad_results(tmp_path: Path, change: dict[str, Any], message: str) -> None:

@@ -25,6 +25,7 @@ def measure(
     carm: str = "cios_fusion",
     preset: Literal["paper", "fast"] = "paper",
     spacing_mm: float = 1.0,
+    seed: int = 0,
     overlay: bool = False,
 ) -> None:
     """Measure the images, in words.
@@ -52,6 +53,12 @@ def fail(kind: str, out: Path) -> None:
             (built / "no.txt").read_text()
         if kind == "forbidden":
             raise PermissionError(13, "Permission denied", "locked.tif")
+        if kind == "full":
+            raise OSError(28, "No space left on device", "half.txt")
+        if kind == "nameless":
+            raise OSError(28, "No space left on device")
+        if len(kind) > 1000:
+            raise InputError(f"{kind}: is no kind.")
         if kind == "interrupted":
             raise KeyboardInterrupt
         raise ZeroDivisionError
@@ -149,9 +156,51 @@ def test_a_run_that_ends_early_says_why_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_defect_keeps_its_traceback(tmp_path: Path) -> None:
+def test_a_defect_is_one_line_and_keeps_its_traceback_for_who_asks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["fail", "defect", str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err
+    assert "defect: ZeroDivisionError" in error
+    assert "test_main.py, line" in error
+    assert error.count("\n") == 1
+    monkeypatch.setenv("FEMOREG_TRACEBACK", "1")
     with pytest.raises(ZeroDivisionError):
         main(["fail", "defect", str(tmp_path / "run")])
+
+
+@pytest.mark.parametrize("kind", ["full", "nameless"])
+def test_a_full_disk_is_one_line(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fail", kind, str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err
+    assert error.endswith("No space left on device.\n")
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_message_is_cut_and_cannot_steer_a_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fail", "\x1b[31m" + "x" * 100_000, str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err
+    assert len(error) < 2100
+    assert "\x1b" not in error
+
+
+@pytest.mark.parametrize("option", ["seed=-1", "seed=99999999999", "spacing-mm=0"])
+def test_options_out_of_range_are_one_line(option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["measure", "a.png", "--out", "run", f"--{option}"]) == 2
+    error = capsys.readouterr().err
+    assert "was expected" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "out: !!bool abc", "a: &a [*a]", "out: run\nout: walk"])
+def test_broken_option_files_are_one_line(tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "options.yaml").write_text(text)
+    assert main(["measure", "a.png", "--config", str(tmp_path / "options.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("femoreg: ")
+    assert error.count("\n") == 1
+    assert len(error) < 2100
 
 
 @pytest.mark.parametrize("what", ["ct", "image", "case", "landmarks", "mesh"])

@@ -54,9 +54,9 @@ def test_a_file_extends_a_preset_or_a_file_beside_it(tmp_path: Path) -> None:
         ("extends: none.yaml", r"none\.yaml: no such file"),
         ("extends: none", r"no carm preset 'none'; there are: .*cios_fusion"),
         ("extends: [a]", r"mine\.yaml, extends: the name of a preset"),
-        ("- a", r"mine\.yaml: a YAML mapping .* found list"),
+        ("- a", r"mine\.yaml: a mapping .* found list"),
         ("a: [", r"mine\.yaml: cannot be read as YAML"),
-        ("a: 2020-13-45", r"mine\.yaml: cannot be read as YAML"),
+        ("a: !!bool abc", r"mine\.yaml, line 1: tag .*bool"),
     ],
 )
 def test_bad_files(tmp_path: Path, text: str, message: str) -> None:

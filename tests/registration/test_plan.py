@@ -124,7 +124,7 @@ def test_a_file_may_change_a_preset(tmp_path: Path) -> None:
         ({"weights": ["bone"]}, "step 1.*weights"),
         ({"bodies": [{**STAGE["bodies"][0], "rotation_deg": [1, 1]}]}, "step 1.*need three numbers"),  # type: ignore[index,dict-item]
         ({"bodies": [{**STAGE["bodies"][0], "move": ["views"]}]}, "step 1.*needs `images: all`"),  # type: ignore[index,dict-item]
-        ({"level": {"pixel_mm": 0, "step_mm": 1}}, "step 1.*must be positive"),
+        ({"level": {"pixel_mm": 0, "step_mm": 1}}, "step 1: pixel_mm: 0.01 to 100"),
         ({"similarity": {"kind": "mi"}}, "step 1, similarity: unknown kind 'mi'. Known kinds: grad_ncc, ncc"),
         ({"similarity": {"kind": "ncc", "radius": 3}}, "step 1, similarity, ncc: unknown key 'radius'"),
         ({"optimiser": {"population": 3}}, "step 1, optimiser: a mapping with the key `kind`"),

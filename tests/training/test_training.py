@@ -133,7 +133,7 @@ def test_presets_are_found_by_name_or_file_and_overridden() -> None:
         "network.landmarks=3": "3 landmarks, but the anatomy hip has",
         "loss=3": "loss: a mapping",
         "optimisation.epochs=many": "optimisation.epochs",
-        "optimisation.epochs=[": "not YAML",
+        "optimisation.epochs=[": "cannot be read as YAML",
     }.items():
         with pytest.raises(InputError, match=message):
             read_settings("hip14", [override])

@@ -1,8 +1,8 @@
 """Closed surfaces of the bones of one hip, from a file."""
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import trimesh
@@ -14,6 +14,7 @@ from femoreg_torch.volume import check_closed
 Points = NDArray[np.float64]
 
 BONES = ("hip_left", "hip_right", "sacrum", "femur_left", "femur_right")
+_MOST_BYTES = 2**30
 _ABOUT = ("source", "licence", "role")
 
 
@@ -37,13 +38,23 @@ def read_surfaces(path: Path) -> BoneSurfaces:
     if not path.is_file():
         raise InputError(f"{path}: no such file.")
     try:
-        with np.load(path) as content:
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
+                raise InputError(f"{path}: unpacks to more than {_MOST_BYTES / 2**20:g} MB, which no surfaces have.")
+        with np.load(path, allow_pickle=False) as content:
             arrays = {name: content[name] for name in content.files}
-    except (BadZipFile, ValueError, OSError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # of zip, zlib or NumPy, by where the file is damaged
         raise InputError(f"{path}: cannot be read as a NumPy archive (.npz).") from error
-    for name in (f"{bone}_{part}" for bone in BONES for part in ("vertices", "faces")):
-        if name not in arrays or arrays[name].ndim != 2 or arrays[name].shape[1] != 3:
-            raise InputError(f"{path}: an array `{name}` of shape (N, 3) was expected.")
+    for bone in BONES:
+        for name, kinds in ((f"{bone}_vertices", "fiu"), (f"{bone}_faces", "iu")):
+            found = arrays.get(name)
+            if found is None or found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in kinds:
+                raise InputError(f"{path}: an array `{name}` of shape (N, 3) was expected.")
+        faces, count = arrays[f"{bone}_faces"], len(arrays[f"{bone}_vertices"])
+        if faces.size and (faces.min() < 0 or faces.max() >= count):
+            raise InputError(f"{path}: `{bone}_faces` names a corner that is not among the vertices.")
     bones = {
         bone: check_closed(
             trimesh.Trimesh(arrays[f"{bone}_vertices"].astype(float), arrays[f"{bone}_faces"], process=False),

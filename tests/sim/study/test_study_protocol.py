@@ -136,7 +136,7 @@ def test_settings_are_told_apart_by_what_they_change_alone(tmp_path: Path) -> No
     ("content", "says"),
     [
         ({"vary": [{"name": "a"}], "color": 1}, "unknown key 'color'"),
-        ({"vary": [{"name": "a", "xray": {"kpv": 80}}]}, "a: .*kpv"),
+        ({"vary": [{"name": "a", "xray": {"kpv": 80}}]}, "a, xray: unknown key 'kpv'"),
         ({"vary": [{"name": "a", "told": {"fault": "rain"}}]}, "no fault 'rain'"),
         ({"vary": [{"name": "a", "preset": "quickest"}]}, "no registration preset 'quickest'"),
         ({"vary": [{"name": "a/b"}]}, "letters, digits and _"),

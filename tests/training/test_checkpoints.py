@@ -1,0 +1,87 @@
+"""Runs that cannot go on as they are told to: checkpoints cut off or of another network, no GPU, odd overrides."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from femoreg_torch.errors import InputError
+from training.checkpoints import last_good_checkpoint, read_checkpoint
+from training.module import NetworkTraining
+from training.run import Machine, train_network
+from training.settings import TrainingSettings, read_settings
+
+SMALL = ["network.channels=[4, 4]", "network.convolutions=[1, 1]"]
+
+
+def settings(*overrides: str) -> TrainingSettings:
+    return read_settings("quick", [*SMALL, *overrides])
+
+
+def training(told: TrainingSettings) -> NetworkTraining:
+    return NetworkTraining(told.network, told.loss, told.run.optimisation)
+
+
+def written(path: Path, module: NetworkTraining, age: int) -> Path:
+    torch.save({"state_dict": module.state_dict(), "global_step": 5}, path)
+    os.utime(path, (1000 - age, 1000 - age))
+    return path
+
+
+def test_a_truncated_checkpoint_is_told_and_passed_over(tmp_path: Path) -> None:
+    module = training(settings())
+    last = written(tmp_path / "last.ckpt", module, 0)
+    best = written(tmp_path / "best.ckpt", module, 60)
+    told: list[str] = []
+    assert last_good_checkpoint(tmp_path, module, told.append) == last
+    content = last.read_bytes()
+    for length in (0, 10, len(content) // 2, len(content) - 10):
+        last.write_bytes(content[:length])
+        assert last_good_checkpoint(tmp_path, module, told.append) == best
+    assert len(told) == 4
+    assert all("last.ckpt: is cut off" in line and "\n" not in line for line in told)
+    best.write_bytes(b"")
+    with pytest.raises(InputError, match="holds no whole checkpoint"):
+        last_good_checkpoint(tmp_path, module, told.append)
+
+
+def test_a_checkpoint_of_other_channels_is_refused(tmp_path: Path) -> None:
+    written(tmp_path / "last.ckpt", training(settings()), 0)
+    other = training(settings("network.channels=[4, 6]"))
+    with pytest.raises(InputError, match="is of another network than the settings name"):
+        last_good_checkpoint(tmp_path, other, print)
+
+
+def test_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
+    class Evil:
+        def __reduce__(self) -> tuple[object, ...]:
+            return Path.touch, (tmp_path / "done",)
+
+    torch.save({"state_dict": Evil(), "global_step": 5}, tmp_path / "last.ckpt")
+    with pytest.raises(InputError, match=r"last\.ckpt: is cut off, damaged, or no checkpoint"):
+        read_checkpoint(tmp_path / "last.ckpt")
+    assert not (tmp_path / "done").exists()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_cuda_without_a_gpu_is_refused_before_anything_is_rendered(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--accelerator cuda: 1 GPUs were asked for, torch sees 0"):
+        train_network(settings(), [], tmp_path / "run", tmp_path / "cache", machine=Machine("cuda"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "[1, 2]", "cohort=[1, 2]", "network=[1]", "network.landmarks=15", "network.channels=[]",
+        "optimisation.epochs=0",
+        "optimisation.epochs=1e99", "cohort.views=-1", "=3", "loss=3", "optimisation.learning_rate=true",
+        "optimisation.epochs=!!int 3", "cohort.patient_seeds=[-1]", "augmentation.scale=[2, 1]", "x" * 10_000 + "=1",
+    ],
+)  # fmt: skip
+def test_odd_overrides_are_one_line(override: str) -> None:
+    with pytest.raises(InputError) as raised:
+        settings(override)
+    assert "\n" not in str(raised.value)
+    assert len(str(raised.value)) < 1500
