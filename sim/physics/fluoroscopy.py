@@ -38,7 +38,7 @@ XRAY_RANGES: dict[str, tuple[float, float]] = {  # of what a C-arm can do, and m
     "blur_sigma_mm": (0, 20),
     "electronic_noise": (0, 1e6),
     "gain_spread": (0, 1),
-    "open_beam_counts": (10, 1e7),
+    "open_beam_counts": (10, 1e12),
 }
 
 

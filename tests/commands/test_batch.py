@@ -31,7 +31,7 @@ def test_a_killed_process_loses_its_own_case_alone() -> None:
 
 @pytest.mark.parametrize(
     ("options", "says"),
-    [(["--jobs", "0"], "at least 1"), (["--preset", "quickest"], "derivative_free"), (["--jobs", "1"], "'case'")],
+    [(["--jobs", "0"], "--jobs: 1 to"), (["--preset", "quickest"], "derivative_free"), (["--jobs", "1"], "'case'")],
 )
 def test_bad_options_are_told_before_any_case(
     options: list[str], says: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]

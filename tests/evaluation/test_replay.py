@@ -152,7 +152,7 @@ def case_moved(run: Path) -> None:
     ("spoil", "arguments", "says"),
     [
         (without_moments, [], "Register again"),
-        (two_views, [], "2 views, but"),
+        (two_views, [], "2 views were expected"),
         (case_moved, [], "Name the case folder with --case"),
         (lambda run: None, ["--out", "replay.avi"], "ends in .gif, .mp4, .webm"),
     ],

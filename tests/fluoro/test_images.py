@@ -127,9 +127,9 @@ def damaged(kind: str, folder: Path) -> Path:
     ("kind", "message"),
     [
         ("missing", "no such file"),
-        ("text", "cannot be read as a PNG or TIFF"),
-        ("empty", "cannot be read as a PNG or TIFF"),
-        ("cut", "cannot be read as a PNG or TIFF"),
+        ("text", "cannot be read as a PNG, TIFF or JPEG"),
+        ("empty", "cannot be read as a PNG, TIFF or JPEG"),
+        ("cut", "cannot be read as a PNG, TIFF or JPEG"),
         ("colour", "colour image"),
         ("constant", "every pixel is 77"),
         ("no dicom", "not a DICOM file"),

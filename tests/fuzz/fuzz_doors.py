@@ -40,7 +40,6 @@ from sim.labelled.deepfluoro import load_dataset_settings
 from sim.labelled.image_files import read_labelled
 from sim.labelled.settings import load_labelled_settings
 from sim.patient.around_surfaces.surfaces import BONES, read_surfaces
-from sim.study.conditions import read_conditions
 from sim.study.protocol import load_protocol
 from sim.theatre.settings import load_simulation
 from training.checkpoints import read_checkpoint
@@ -335,7 +334,7 @@ _READERS: Mapping[str, Callable[[str], Any]] = {
     "simulation/deepfluoro": load_dataset_settings,
     "training/hip14": read_settings,
     "study/paper": load_protocol,
-    "study/conditions": read_conditions,
+    "study/conditions": load_protocol,
     "planning/default": load_planning,
     "anatomy/hip": load_anatomy,
 }

@@ -33,6 +33,8 @@ def test_broken_results_by_the_commands_that_read_them(
     run, case = door.path.parent, tmp_path / "_case" / "case, short"
     monkeypatch.setattr(femoreg_torch.evaluation.run, "prepare_scene", lambda *_: None)
     monkeypatch.setattr(femoreg_torch.evaluation.run, "evaluate", lambda *_: None)
+    monkeypatch.setattr(femoreg_torch.evaluation.run, "draw", lambda *_: None)
+    monkeypatch.setattr(femoreg_torch.evaluation.run, "report_page", lambda *_: "page")
     monkeypatch.setattr(femoreg_torch.evaluation.run, "overlay_figure", lambda *_: np.zeros((9, 9, 3), np.uint8))
     capfd.readouterr()
     finds = []

@@ -140,7 +140,9 @@ def test_parts_reach_the_scene(tmp_path: Path) -> None:
         "guess": Model(sleeve, 5000.0),
         "named": Model(sleeve, None, material="steel"),
     }
-    start = Start(camera1_from=torch.eye(4, dtype=torch.float64))
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[2, 3] = 500
+    start = Start(camera1_from=pose)
     objects = {name: CaseObject(name, model=model, start=start) for name, model in models.items()}
     carm = CArm(centred_camera(1000.0, (1.0, 1.0), (9, 9)), (0.0, 0.0, 500.0), (0.0, 1.0, 0.0))
     case = Case(tmp_path, carm, objects, views=(View({"image": tmp_path / "view.tif"}, "log"),))

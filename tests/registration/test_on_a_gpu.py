@@ -198,7 +198,7 @@ def test_a_stage_waits_once_per_evaluation(scene: Scene, gpu: PretendedGpu | Non
     waits = []
     for iterations in (1, 4):
         gpu.waits.clear()
-        optimiser = LevenbergMarquardt(max_iterations=iterations, tol_x=0, tol_f=-1)
+        optimiser = LevenbergMarquardt(max_iterations=iterations, tol_x=0, tol_f=0)
         evaluations = run_stage(there, poses, replace(one, optimiser=optimiser), (0,), 0).evaluations
         waits.append((evaluations, gpu.waits.total()))
     (few, waited), (many, longer) = waits

@@ -66,7 +66,7 @@ def test_a_checkpoint_runs_no_code(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_cuda_without_a_gpu_is_refused_before_anything_is_rendered(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--accelerator cuda: 1 GPUs were asked for, torch sees 0"):
+    with pytest.raises(InputError, match="--device cuda: 1 GPUs were asked for, torch sees 0"):
         train_network(settings(), [], tmp_path / "run", tmp_path / "cache", machine=Machine("cuda"))
     assert list(tmp_path.iterdir()) == []
 

@@ -59,9 +59,11 @@ def test_the_table_holds_loads_gains_and_what_was_not_run() -> None:
 )
 def test_meshes_are_held_against_the_finest(tmp_path: Path, load: float, gain: float, kept: str) -> None:
     rows = [MeshRow(3.0, 6400, load, gain, 8.0), MeshRow(2.0, 21000, 2000.0, 0.40, 40.0)]
-    (tmp_path / "planning.md").write_text("# Plan\n\nHead.\n\n## What was measured\n\nOld.\n\n## Last\n\nKept.\n")
+    (tmp_path / "planning.md").write_text(
+        "# Plan\n\nHead.\n\n## What was measured\n\nOld.\n\n## Last\n\nKept.\n", encoding="utf-8"
+    )
     write_plans([found({}, rows)], "make plans", tmp_path)
-    page = (tmp_path / "planning.md").read_text()
+    page = (tmp_path / "planning.md").read_text(encoding="utf-8")
     assert f"of the finest (2 mm): {kept}." in page
     assert ("**3 mm is not**" in page) == (kept == "2 mm")
     assert "Not run: 2.5 mm, 1.5 mm." in page

@@ -45,9 +45,9 @@ def test_a_failed_run_is_told_and_the_status_says_so(tmp_path: Path, capsys: pyt
     ("options", "says"),
     [
         (["nothing"], "there are: "),
-        (["paper", "-n", "0"], "--procedures: at least 1"),
+        (["paper", "-n", "0"], "--procedures: 1 to"),
         (["paper", "-n", "many"], "many"),
-        (["paper", "--jobs", "0"], "--jobs: at least 1"),
+        (["paper", "--jobs", "0"], "--jobs: 1 to"),
         (["cadaver"], "has no `vary`"),
         (["paper", "--data", "nowhere"], "nowhere/meshes/bmf.npz"),
     ],
