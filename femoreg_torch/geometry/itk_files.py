@@ -1,14 +1,31 @@
 """Rigid transforms in files of ITK and 3D Slicer: `.tfm`, `.txt`, `.mat`, `.h5`."""
 
+import io
+import math
 from pathlib import Path
 
+import numpy as np
 import SimpleITK as sitk
 import torch
+from scipy.io import loadmat
 from torch import Tensor
 
 from femoreg_torch.arrays import quiet
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry.rigid import check_rigid, invert_rigid, rigid
+from femoreg_torch.text import read_bytes
+
+_MOST_BYTES = 2**16  # of a file with one transform
+
+
+# Linear transforms in 3-D, and how many parameters they have. ITK crashes on files whose numbers are fewer.
+_PARAMETERS = {
+    "AffineTransform": 12, "MatrixOffsetTransformBase": 12, "Euler3DTransform": 6, "VersorRigid3DTransform": 6,
+    "Rigid3DTransform": 12, "VersorTransform": 3, "QuaternionRigidTransform": 7, "Similarity3DTransform": 7,
+    "ScaleVersor3DTransform": 9, "ScaleSkewVersor3DTransform": 15, "ScaleTransform": 3, "TranslationTransform": 3,
+    "IdentityTransform": 0,
+}  # fmt: skip
+_FIXED = (0, 3, 4)  # a centre, or none; Euler angles have a flag for their order besides
 
 
 def read_itk_transform(path: Path) -> Tensor:
@@ -17,6 +34,7 @@ def read_itk_transform(path: Path) -> Tensor:
     3D Slicer saves a transform so: under `b_from_a` a model of frame a appears in frame b. Raises `InputError` for what
     is no rigid transform in 3-D.
     """
+    check_transform_file(path)
     try:
         with quiet():
             transform = sitk.ReadTransform(str(path))
@@ -31,3 +49,52 @@ def read_itk_transform(path: Path) -> Tensor:
     )
     a_from_b = rigid(torch.stack([axis - origin for axis in axes], 1), origin)
     return invert_rigid(check_rigid(a_from_b, str(path)))
+
+
+def check_transform_file(path: Path) -> None:
+    """Raises `InputError` for a text or MATLAB file that does not hold the numbers of one linear transform in 3-D."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".tfm", ".txt", ".mat"):
+        return
+    content = read_bytes(path, _MOST_BYTES)
+    try:
+        kind, numbers, fixed = _of_matlab(content) if suffix == ".mat" else _of_text(content.decode("utf-8"))
+    except (UnicodeDecodeError, ValueError, TypeError, KeyError, OSError, NotImplementedError, MemoryError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: cannot be read as an ITK transform ({reason}).") from error
+    name = kind.partition("_")[0]
+    if name not in _PARAMETERS:
+        raise InputError(f"{path}: a rigid transform in 3D was expected, found {shortened(kind)}.")
+    if not kind.endswith("_3_3") or numbers != _PARAMETERS[name] or fixed not in _FIXED:
+        raise InputError(
+            f"{path}: cannot be read as an ITK transform ({shortened(kind)} with {numbers} parameters and {fixed} "
+            "fixed ones)."
+        )
+
+
+def _of_text(content: str) -> tuple[str, int, int]:
+    """The kind of a transform, and how many finite parameters and fixed ones it has. Raises `ValueError`."""
+    found: dict[str, str] = {}
+    for line in content.splitlines():
+        key, colon, value = line.partition(":")
+        if line.startswith("#") or not line.strip():
+            continue
+        if not colon or key in found or key not in ("Transform", "Parameters", "FixedParameters"):
+            raise ValueError("one transform was expected, with Parameters and FixedParameters")
+        found[key] = value.strip()
+    counts = []
+    for key in ("Parameters", "FixedParameters"):
+        values = [float(word) for word in found.get(key, "").split()]
+        if not all(map(math.isfinite, values)):
+            raise ValueError(f"{key} are not all finite")
+        counts.append(len(values))
+    return found["Transform"], counts[0], counts[1]
+
+
+def _of_matlab(content: bytes) -> tuple[str, int, int]:
+    """As `_of_text`, of a MATLAB file. Raises `ValueError`."""
+    found = {name: value for name, value in loadmat(io.BytesIO(content)).items() if not name.startswith("__")}
+    (kind,) = (name for name in found if name != "fixed")
+    if not all(np.isfinite(np.asarray(value, dtype=float)).all() for value in found.values()):
+        raise ValueError("its numbers are not all finite")
+    return kind, int(np.size(found[kind])), int(np.size(found.get("fixed", ())))

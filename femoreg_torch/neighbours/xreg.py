@@ -25,6 +25,7 @@ from torch import Tensor
 from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import check_rigid
+from femoreg_torch.geometry.itk_files import check_transform_file
 from femoreg_torch.neighbours.frames import XregCamera
 
 
@@ -117,6 +118,7 @@ def read_transform(path: Path) -> Tensor:
     """The rigid matrix (4, 4) of an ITK transform file, `.h5` or `.tfm`, as it takes points. Raises `InputError`."""
     if not Path(path).is_file():
         raise InputError(f"{path}: no such file.")
+    check_transform_file(path)
     try:
         with quiet():
             transform = sitk.ReadTransform(str(path))

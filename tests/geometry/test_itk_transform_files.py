@@ -1,0 +1,51 @@
+"""Transforms of ITK and 3D Slicer: every linear kind in every format, and numbers that do not fit their kind."""
+
+from pathlib import Path
+
+import pytest
+import SimpleITK as sitk
+import torch
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import read_itk_transform
+
+AFFINE = (
+    "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\nParameters: {}\n"
+    "FixedParameters: {}\n"
+)
+KINDS = {
+    "euler": sitk.Euler3DTransform((1, 2, 3), 0.1, 0.2, 0.3, (4, 5, 6)),
+    "versor": sitk.VersorRigid3DTransform((0, 1, 0), 0.3, (1, 2, 3)),
+    "translation": sitk.TranslationTransform(3, (1, 2, 3)),
+    "identity": sitk.Transform(3, sitk.sitkIdentity),
+}
+
+
+@pytest.mark.parametrize("suffix", ["tfm", "txt", "mat", "h5"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_in_every_format(tmp_path: Path, kind: str, suffix: str) -> None:
+    path = tmp_path / f"pose.{suffix}"
+    sitk.WriteTransform(KINDS[kind], str(path))
+    matrix = read_itk_transform(path)
+    point = (10.0, -20.0, 30.0)
+    there = torch.tensor([*KINDS[kind].TransformPoint(point), 1.0], dtype=torch.float64)
+    assert torch.allclose(matrix @ there, torch.tensor([*point, 1.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (AFFINE.format("1 0 0 0 1 0 0 0 1", "0 0 0"), "9 parameters"),
+        (AFFINE.format("1 0 0 0 1 0 0 0 1 0 0 0", "0"), "1 fixed"),
+        (AFFINE.format("1 0 0 0 1 0 0 0 1 nan 0 0", "0 0 0"), "not all finite"),
+        (AFFINE.format("1 0 0 0 1 0 0 0 1 0 0 0", "0 0 0").replace("Affine", "BSpline"), "rigid transform"),
+        (AFFINE.format("1 0 0 0 1 0 0 0 1 0 0 0", "0 0 0").replace("Parameters", "Parameter", 1), "one transform"),
+        ("", "cannot be read"),
+    ],
+)
+def test_numbers_that_do_not_fit_never_reach_itk(tmp_path: Path, text: str, says: str) -> None:
+    """ITK crashes on some of them."""
+    path = tmp_path / "pose.tfm"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=says):
+        read_itk_transform(path)
