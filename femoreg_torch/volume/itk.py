@@ -16,6 +16,11 @@ _NOWHERE = re.compile(
     rb"\s*[=:].*?(?:nan|inf)",
     re.IGNORECASE | re.MULTILINE,
 )
+# Lists in the header of a MetaImage, with as many values as the power of its dimensions that is given.
+_META_LISTS = {
+    b"DimSize": 1, b"ElementSpacing": 1, b"ElementSize": 1, b"Offset": 1, b"Position": 1, b"Origin": 1,
+    b"CenterOfRotation": 1, b"TransformMatrix": 2, b"Rotation": 2, b"Orientation": 2,
+}  # fmt: skip
 _DETACHED = (".mhd", ".nhdr", ".hdr", ".img")  # headers, or values, alone
 
 
@@ -53,6 +58,24 @@ def _check_place(path: Path) -> None:
     if path.name.lower().endswith((".mha", ".mhd", ".nrrd", ".nhdr")) and (found := _NOWHERE.search(header)):
         key = found[1].decode()
         raise InputError(f"{path}: `{key}` in its header is not a finite number. Export it anew.")
+    if path.name.lower().endswith((".mha", ".mhd")):
+        _check_meta_image(header, path)
+
+
+def _check_meta_image(header: bytes, path: Path) -> None:
+    """Raises `InputError` for a MetaImage header whose lists are not as long as its dimensions say: MetaIO crashes."""
+    lines = (line.partition(b"=") for line in header.splitlines())
+    found = {key.strip(): value.split() for key, _, value in lines}
+    given = found.get(b"NDims", [])
+    dimensions = int(given[0]) if len(given) == 1 and given[0] in (b"2", b"3", b"4") else 0
+    if not dimensions:
+        raise InputError(f"{path}: `NDims` in its header is to be 2, 3 or 4. Export it anew.")
+    for key, power in _META_LISTS.items():
+        if key in found and len(found[key]) != dimensions**power:
+            raise InputError(
+                f"{path}: `{key.decode()}` in its header has {len(found[key])} values for {dimensions} dimensions. "
+                "Export it anew."
+            )
 
 
 def _read_file(path: Path) -> sitk.Image:

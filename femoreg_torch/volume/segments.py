@@ -189,7 +189,7 @@ def _slicer_segments(path: Path) -> list[Segment]:
         with quiet():
             reader.ReadImageInformation()
             fields = {key: reader.GetMetaData(key) for key in reader.GetMetaDataKeys()}
-    except (RuntimeError, UnicodeDecodeError) as error:
+    except (RuntimeError, UnicodeDecodeError, TypeError) as error:  # the last for keys that are no text
         raise InputError(f"{path}: cannot be read; a segmentation of 3D Slicer (.seg.nrrd) was expected.") from error
     numbers = sorted(int(match[1]) for match in map(_NAME.fullmatch, fields) if match)
     if not numbers:
