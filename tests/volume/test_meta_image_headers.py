@@ -15,7 +15,7 @@ from femoreg_torch.volume.itk import read_itk
     [
         (b"NDims = 3", b"NDims = -1", "NDims"),
         (b"NDims = 3", b"NDims = 2147483648", "NDims"),
-        (b"NDims = 3", b"NDims = 4", "TransformMatrix"),
+        (b"NDims = 3", b"NDims = 4", "DimSize"),
         (b"DimSize = 7 8 9", b"DimSize = 7 8", "DimSize"),
     ],
 )
