@@ -90,7 +90,7 @@ def _read(path: Path, frames: Frames | None) -> DicomImage:
     dataset = _dataset(path)
     check_pixels(path, int(dataset.get("Rows") or 1), int(dataset.get("Columns") or 1))
     tags = _tags(dataset, path)
-    stored = _pixels(dataset, _numbers(dataset, frames, path), path)
+    stored = _pixels(dataset, _numbers(dataset, frames, path))
     if stored.ndim == 3 and stored.shape[-1] == 3:
         if (stored != stored[..., :1]).any():
             return DicomImage(stored, tags, None, None, (), None)  # refused by its shape
@@ -139,17 +139,13 @@ def _numbers(dataset: Any, frames: Frames | None, path: Path) -> tuple[int, ...]
     return tuple(n - 1 for n in chosen)
 
 
-def _pixels(dataset: Any, frames: tuple[int, ...], path: Path) -> Values:
+def _pixels(dataset: Any, frames: tuple[int, ...]) -> Values:
     """Stored values (H, W), or (H, W, 3); the mean, float64, of several frames."""
     from pydicom.pixels import pixel_array
 
-    try:
-        packed = dataset.file_meta.TransferSyntaxUID.is_compressed
-        read = [pixel_array(dataset, index=n, correct_unused_bits=packed) for n in frames]
-        read = read if packed else [_stored_bits(dataset, pixels) for pixels in read]
-    except (AttributeError, IndexError, KeyError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: the DICOM file holds no image that can be decoded ({reason}).") from error
+    packed = dataset.file_meta.TransferSyntaxUID.is_compressed
+    read = [pixel_array(dataset, index=n, correct_unused_bits=packed) for n in frames]
+    read = read if packed else [_stored_bits(dataset, pixels) for pixels in read]
     return read[0] if len(read) == 1 else np.mean(read, axis=0)
 
 

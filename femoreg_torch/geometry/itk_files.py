@@ -57,7 +57,7 @@ def check_transform_file(path: Path) -> None:
     if suffix not in (".tfm", ".txt", ".mat"):
         return
     content = read_bytes(path, _MOST_BYTES)
-    try:
+    try:  # what SciPy's reader of MATLAB files raises for whatever its parsing runs into, and numbers that are none
         kind, numbers, fixed = _of_matlab(content) if suffix == ".mat" else _of_text(content.decode("utf-8"))
     except (UnicodeDecodeError, ValueError, TypeError, KeyError, OSError, NotImplementedError, MemoryError) as error:
         reason = " ".join(str(error).split())[:200]

@@ -22,10 +22,8 @@ import SimpleITK as sitk
 import torch
 from torch import Tensor
 
-from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import check_rigid
-from femoreg_torch.geometry.itk_files import check_transform_file
+from femoreg_torch.geometry import invert_rigid, read_itk_transform
 from femoreg_torch.neighbours.frames import XregCamera
 
 
@@ -118,18 +116,7 @@ def read_transform(path: Path) -> Tensor:
     """The rigid matrix (4, 4) of an ITK transform file, `.h5` or `.tfm`, as it takes points. Raises `InputError`."""
     if not Path(path).is_file():
         raise InputError(f"{path}: no such file.")
-    check_transform_file(path)
-    try:
-        with quiet():
-            transform = sitk.ReadTransform(str(path))
-    except (RuntimeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as an ITK transform.") from error
-    # of any linear transform: where it takes the origin and the ends of the axes
-    ends = [np.array(transform.TransformPoint(tuple(point))) for point in np.vstack([np.zeros(3), np.eye(3)])]
-    found = np.eye(4)
-    found[:3, :3] = np.stack([end - ends[0] for end in ends[1:]], axis=1)
-    found[:3, 3] = ends[0]
-    return check_rigid(torch.from_numpy(found), str(path))
+    return invert_rigid(read_itk_transform(path))
 
 
 def write_transform(path: Path, matrix: Tensor) -> None:

@@ -199,7 +199,7 @@ def _pixels(path: Path) -> NDArray[np.float32]:
     from pydicom.pixels import apply_rescale
 
     data = pydicom.dcmread(path, force=True)
-    try:
+    try:  # what pydicom and its decoders raise for tags that lack or contradict one another, and for broken pixels
         return apply_rescale(data.pixel_array, data).astype(np.float32)
     except (AttributeError, KeyError, NotImplementedError, RuntimeError, ValueError) as error:
         raise InputError(f"{path}: the slice cannot be decoded ({error}). Export the series anew.") from error
@@ -314,7 +314,7 @@ def _multi_frame(path: Path) -> sitk.Image:
     """An enhanced CT: all slices as frames of one file. Raises `InputError`."""
     import highdicom  # half a second, and few CTs are of this kind
 
-    try:
+    try:  # what pydicom and highdicom raise for tags that lack or contradict one another, and for broken pixels
         volume = highdicom.imread(path).get_volume(dtype=np.float32)
     except (AttributeError, KeyError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
         raise InputError(

@@ -266,7 +266,7 @@ def _dicom_reader(path: Path) -> Callable[[Segment], tuple[NDArray[np.bool_], si
     import highdicom  # half a second, and few segmentations are of this kind
 
     path = _dicom_file(path)
-    try:
+    try:  # what pydicom and highdicom raise for tags that lack or contradict one another
         segmentation = highdicom.seg.segread(path)
     except (AttributeError, KeyError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
         raise InputError(
@@ -274,7 +274,7 @@ def _dicom_reader(path: Path) -> Callable[[Segment], tuple[NDArray[np.bool_], si
         ) from error
 
     def mask_of(segment: Segment) -> tuple[NDArray[np.bool_], sitk.Image]:
-        try:
+        try:  # the same, and for frames that make no volume
             volume = segmentation.get_volume(segment_numbers=[segment.label])
         except (AttributeError, KeyError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
             raise InputError(
