@@ -8,10 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
-from skimage.measure import marching_cubes
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -72,6 +70,10 @@ def surface_of(volume: Volume) -> tuple[Array, NDArray[np.int64]] | None:
     padding = [side for length in reversed(box.shape) for side in (factor, factor + -length % factor)]
     share = F.avg_pool3d(F.pad(box, padding)[None, None], factor)[0, 0].numpy()
     filled = np.maximum(share, ndimage.binary_fill_holes(share > 0.5))
+    from skimage.measure import (
+        marching_cubes,  # as trimesh below: `femoreg register` imports this room and draws nothing
+    )
+
     corners, faces, _, _ = marching_cubes(ndimage.gaussian_filter(filled, 0.6), 0.4)
     index = (corners[:, ::-1] + 0.5) * factor - 0.5 - factor + np.array([x0, y0, z0])  # x, y, z of the whole volume
     points = transform_points(volume.lps_from_index, torch.from_numpy(np.ascontiguousarray(index, np.float64)))
@@ -104,6 +106,8 @@ def _rods(case: Case, result: Result) -> Iterator[dict[str, Any]]:
         return
     entry, target = transform_points(poses[plan.object], torch.stack([plan.entry_point, plan.target])).numpy()
     yield _rod("planned path", entry, target, hexadecimal(PATH))
+    import trimesh
+
     ball = trimesh.creation.icosphere(subdivisions=2, radius=2.5 * _ROD_MM)
     yield _mesh("entry point", np.asarray(ball.vertices) + entry, np.asarray(ball.faces), hexadecimal(PATH), 1.0)
     if plan.tool is not None and plan.tool in poses:
@@ -113,6 +117,8 @@ def _rods(case: Case, result: Result) -> Iterator[dict[str, Any]]:
 
 
 def _rod(name: str, start: Array, end: Array, colour: str) -> dict[str, Any]:
+    import trimesh
+
     rod = trimesh.creation.cylinder(radius=_ROD_MM, segment=np.stack([start, end]), sections=12)
     return _mesh(name, np.asarray(rod.vertices), np.asarray(rod.faces), colour, 1.0)
 
