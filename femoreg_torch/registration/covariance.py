@@ -25,7 +25,8 @@ from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.intrinsics import Intrinsics, Profile, profile
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, image_quadratic
+from femoreg_torch.registration.motion import MotionBetween, motions_between
+from femoreg_torch.registration.objective import image_costs, mean_quadratic
 from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, reference_point_in_view
 from femoreg_torch.similarity import Similarity
 
@@ -49,6 +50,7 @@ class PoseCovariance:
     centres: Tensor  # (B, 3) mm: what each body turns about, in its camera
     intrinsics: "IntrinsicsEstimate"
     step: Tensor  # (6 B,): where all images together would move the bodies, were all free with these intrinsics
+    motions: tuple[MotionBetween, ...] = ()  # of the anatomy between kinds of images, were it free to move
 
     def of(self, first: str, second: str | None = None) -> Tensor:
         """The block (6, 6) of one body, or of two."""
@@ -126,7 +128,8 @@ def pose_covariance(
     moving: tuple[Moving, ...] = (*bodies, refined)
     costs = image_costs(scene, poses, moving, objects, images, level, similarity, imaging=imaging)
     rigid = 6 * len(bodies)
-    model = image_quadratic(costs, torch.zeros(rigid + len(refined.free), dtype=torch.float64))
+    parts = costs.quadratics(torch.zeros(rigid + len(refined.free), dtype=torch.float64))
+    model = mean_quadratic(parts)
     inverse = torch.linalg.pinv(model.hessian[:rigid, :rigid], hermitian=True)
     clusters = len(model.scores) / (len(model.scores) - 1)
     scores = model.scores[:, :rigid]
@@ -136,6 +139,7 @@ def pose_covariance(
     response = of_intrinsics.answer + _slides(refined, poses, bodies)
     off = mean - refined.units_off
     matrix = by_images + response @ (spread + off[:, None] * off) @ response.T
+    centres = torch.stack([body.centre for body in bodies])
     estimate = IntrinsicsEstimate(torch.zeros_like(refined.scale), torch.zeros_like(refined.scale))
     estimate.mean[refined.free] = mean
     estimate.deviation[refined.free] = spread.diagonal().sqrt()
@@ -143,9 +147,10 @@ def pose_covariance(
         (*objects, *(f"view {view + 1}" for view in found)),
         matrix,
         by_images,
-        torch.stack([body.centre for body in bodies]),
+        centres,
         estimate,
         -inverse @ model.gradient[:rigid],
+        motions_between(scene, parts, images, objects, centres),
     )
 
 

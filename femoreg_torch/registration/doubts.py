@@ -20,6 +20,10 @@ from femoreg_torch.registration.scene import Scene
 # sags by a few mm more. A mirrored image ended 121 mm and 10° off.
 _MOST_OFF_ORBIT_MM, _MOST_OFF_ORBIT_DEG = 60.0, 15.0
 _ORBIT_DEG = 100.0
+# Of the anatomy between images without and with the device. Seen in all views together where nothing had moved,
+# whatever else was wrong: at most 0.1 mm, 0.2° and 1.4 deviations; in one view by itself 0.4 mm, 0.1° and 2.8. Where a
+# patient had moved by 1 mm and 1°: 0.9 to 1.1°, and 10 to 12 deviations.
+_MOST_MOTION_MM, _MOST_MOTION_DEG, _SURE_OF_MOTION = 0.3, 0.3, 3.0
 # Of the file's standard deviation, where intrinsics were refined. Seen: 1.4 and 1.7 where all were told 12 mm off (six
 # deviations), at most 0.5 where the source distance alone was wrong.
 _MOST_SHIFT = 0.9
@@ -44,6 +48,7 @@ def doubts(
     return (
         *doubts_about_the_carm(scene, poses, covariance, limits),
         *doubts_about_the_views(scene, poses),
+        *doubts_about_motion(covariance),
         *doubts_about_the_plan(case, scene),
         *doubts_about_the_models(told, scene),
         *doubts_about_handedness(scene, poses, imaging),
@@ -98,6 +103,26 @@ def doubts_about_the_views(scene: Scene, poses: Poses) -> tuple[str, ...]:
                 "mirrored or turned and shows the same patient; if the C-arm was moved so far, give its poses"
             )
     return tuple(told)
+
+
+def doubts_about_motion(covariance: PoseCovariance) -> tuple[str, ...]:
+    """Anatomy that lies elsewhere in images of another kind, in words."""
+    if not any(
+        found.sureness > _SURE_OF_MOTION and (found.size[0] > _MOST_MOTION_DEG or found.size[1] > _MOST_MOTION_MM)
+        for found in covariance.motions
+    ):
+        return ()
+    found = max(covariance.motions, key=lambda each: each.gain)
+    deg, mm = found.size
+    where = "" if len(found.views) > 1 else f" of view {found.views[0] + 1}"
+    moved = (
+        "the patient or the C-arm has moved" if where or len(found.objects) > 1 else f"the {found.objects[0]} has moved"
+    )
+    lies = " and ".join(found.objects)
+    return (
+        f"in the {found.kind} images{where}, {lies} lie{'s' if len(found.objects) == 1 else ''} {mm:.1f} mm and "
+        f"{deg:.1f}° from where the other images show them: {moved} between the images; take them again",
+    )
 
 
 def doubts_about_the_plan(case: Case, scene: Scene) -> tuple[str, ...]:

@@ -301,7 +301,11 @@ def stage_objective(costs: ImageCosts, bodies: tuple[Moving, ...], prior: Prior 
 
 def image_quadratic(costs: ImageCosts, delta: Tensor) -> Quadratic:
     """Mean cost over the images about one delta (Σ n_b,), without penalties."""
-    parts = costs.quadratics(delta)
+    return mean_quadratic(costs.quadratics(delta))
+
+
+def mean_quadratic(parts: Sequence[Quadratic]) -> Quadratic:
+    """The mean of what images say, one by one, of the same delta."""
     return Quadratic(
         sum(part.value for part in parts) / len(parts),
         torch.cat([part.scores / len(parts) for part in parts]),

@@ -1,0 +1,98 @@
+"""Has the anatomy moved between the images without and with the device?
+
+All images are registered as if the anatomy had stayed where it was and the C-arm had come back to where it was. The
+images tell whether that holds: let the anatomy, or one of its bones, move by a rigid motion y in the images of another
+kind than the first, in all views at once (the patient moved) or in one alone (the C-arm did not come back), and let
+everything else be refitted. With curvature and scores profiled as those of the intrinsics are
+(`registration.covariance`), the step of Newton is −S⁻¹ Σ r, and its covariance that of the sandwich estimator over
+tiles, S⁻¹ R S⁻¹.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.geometry.rigid import skew
+from femoreg_torch.optimize import Quadratic
+from femoreg_torch.registration.scene import Kind, Scene
+
+Image = tuple[Kind, int]
+
+
+@dataclass(frozen=True, eq=False)
+class MotionBetween:
+    """How objects lie in some images of one kind, beside where they lie in the others."""
+
+    kind: Kind
+    views: tuple[int, ...]  # from 0, that it was looked for in, all at once
+    objects: tuple[str, ...]  # that move together
+    motion: Tensor  # (6,) degrees and mm, about the first object's reference point, along the axes of camera 1
+    deviation: Tensor  # (6,)
+    gain: float  # by which the motion lowers the cost: what has really moved gains the most
+
+    @cached_property
+    def size(self) -> tuple[float, float]:
+        """Degrees and mm."""
+        return float(self.motion[:3].norm()), float(self.motion[3:].norm())
+
+    @cached_property
+    def sureness(self) -> float:
+        """The motion by its standard deviations: the most certain of its six parts."""
+        return float((self.motion.abs() / self.deviation).max())
+
+
+def motions_between(
+    scene: Scene, parts: Sequence[Quadratic], images: Sequence[Image], names: Sequence[str], centres: Tensor
+) -> tuple[MotionBetween, ...]:
+    """Motions of the anatomy in every kind of images but the first.
+
+    Of all objects of the first kind together in all views, of each by itself, and of all together in each view.
+    `parts` are the models of the `images`, one by one. Their first unknowns are motions (degrees, mm) of bodies about
+    `centres` (B, 3) mm: of the objects `names` in camera 1, and then of the C-arm; others stay.
+    """
+    found = []
+    for kind in dict.fromkeys(kind for kind, _ in images if kind != scene.first_kind):
+        both = {scene.first_kind, kind}
+        anatomy = tuple(name for name in names if both <= set(scene.objects[name].shown_in))
+        views = tuple(view for k, view in images if k == kind)
+        looked_for = [(anatomy, views), *(((name,), views) for name in anatomy), *((anatomy, (v,)) for v in views)]
+        for objects, where in dict.fromkeys(each for each in looked_for if each[0]):
+            bodies = [names.index(name) for name in objects]
+            chosen = [k == kind and view in where for k, view in images]
+            found.append(MotionBetween(kind, where, objects, *_step(parts, chosen, _moves(bodies, centres))))
+    return tuple(found)
+
+
+def _moves(bodies: Sequence[int], centres: Tensor) -> Tensor:
+    """Twists (6 B, 6) of all bodies about their centres when some move as one about the centre of the first of them."""
+    moves = torch.zeros(len(centres), 6, 6, dtype=torch.float64)
+    for body in bodies:
+        moves[body] = torch.eye(6)
+        moves[body, 3:, :3] = -skew(centres[body] - centres[bodies[0]]) * torch.pi / 180  # ω × arm
+    return moves.flatten(0, 1)
+
+
+def _step(parts: Sequence[Quadratic], chosen: Sequence[bool], moves: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Newton's step (6,) of a motion in the chosen images, all bodies refitted; its deviations (6,), and what it gains.
+
+    Scores vary about their mean over the tiles of each image, as a motion gives all of them one sign.
+    """
+    n = len(moves)
+    stay = torch.cat([torch.eye(n, dtype=torch.float64), torch.zeros_like(moves)], 1)  # (n, n + 6)
+    move = torch.cat([torch.eye(n, dtype=torch.float64), moves], 1)
+    ways = [move if here else stay for here in chosen]
+    hessian = torch.stack([w.T @ part.hessian[:n, :n] @ w for part, w in zip(parts, ways, strict=True)]).sum(0)
+    scores = torch.cat([part.scores[:, :n] @ w for part, w in zip(parts, ways, strict=True)])
+    answer = -torch.linalg.pinv(hessian[:n, :n], hermitian=True) @ hessian[:n, n:]
+    curvature = hessian[n:, n:] + hessian[n:, :n] @ answer
+    inverse = torch.linalg.pinv(curvature, hermitian=True)
+    left = scores[:, n:] + scores[:, :n] @ answer
+    spread = torch.zeros_like(inverse)
+    for tiles in left.split([len(part.scores) for part in parts]):
+        apart = tiles - tiles.mean(0)
+        spread += len(tiles) / max(1, len(tiles) - 1) * apart.T @ apart
+    step = -inverse @ left.sum(0)
+    return step, (inverse @ spread @ inverse).diagonal().sqrt(), float(step @ curvature @ step / 2)

@@ -1,0 +1,75 @@
+"""Motion of the patient between images without and with the device: found, told, not seen where there is none."""
+
+from dataclasses import replace
+
+import torch
+from registration_scenes import make_scene, off, true_poses
+
+from femoreg_torch.registration.covariance import pose_covariance
+from femoreg_torch.registration.doubts import doubts_about_motion
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.motion import MotionBetween
+from femoreg_torch.registration.scene import Scene
+from femoreg_torch.similarity import GradNcc
+
+_LEVEL = Level(pixel_mm=3.0, step_mm=2.0)
+_TURN, _SHIFT = (0.0, 0.0, 1.2), (1.4, -0.9, 0.0)  # in the image plane of the first view
+
+
+def _scene(moving: tuple[str, ...], views: tuple[int, ...] = (0, 1, 2)) -> Scene:
+    """Anatomy that has turned about the middle of the pelvis, in the device images of some views."""
+    truth = true_poses()
+    still, there = make_scene(truth), truth
+    for name in moving:
+        pivot = truth.camera1_from[name].inverse() @ truth.camera1_from[moving[0]][:, 3]
+        there = there.with_object(name, off(truth.camera1_from[name], pivot[:3], _TURN, _SHIFT))
+    other = make_scene(there, seed=1).images["device"]
+    mixed = tuple(
+        b if view in views else a for view, (a, b) in enumerate(zip(still.images["device"], other, strict=True))
+    )
+    return replace(still, images=still.images | {"device": mixed})
+
+
+def _motions(scene: Scene) -> tuple[tuple[MotionBetween, ...], tuple[str, ...]]:
+    covariance = pose_covariance(scene, true_poses(), _LEVEL, GradNcc(1))
+    return covariance.motions, doubts_about_motion(covariance)
+
+
+def test_no_motion_is_told_where_nothing_moved() -> None:
+    motions, told = _motions(_scene(()))
+    assert len(motions) == 6  # both bones and each of them in all views, both in each
+    assert told == ()
+    assert max(found.sureness for found in motions) < 3
+    assert motions[0].size[0] < 0.1
+    assert motions[0].size[1] < 0.3
+
+
+def test_a_patient_who_moved_is_told_with_the_motion() -> None:
+    motions, told = _motions(_scene(("pelvis", "femur")))
+    assert motions[0].objects == ("pelvis", "femur")
+    expected = torch.tensor([*_TURN, *_SHIFT], dtype=torch.float64)
+    seen = [2, 3, 4]  # what one view tells; depth and turns out of its plane are less certain
+    torch.testing.assert_close(motions[0].motion[seen], expected[seen], atol=0.35, rtol=0)
+    assert len(told) == 1
+    assert "the patient or the C-arm has moved" in told[0]
+
+
+def test_a_leg_that_moved_is_told_as_that() -> None:
+    _, told = _motions(_scene(("femur",)))
+    assert "femur lies" in told[0]
+    assert "the femur has moved" in told[0]
+
+
+def test_a_c_arm_that_did_not_come_back_is_told_with_its_view() -> None:
+    _, told = _motions(_scene(("pelvis", "femur"), views=(1,)))
+    assert "of view 2" in told[0]
+
+
+def test_one_kind_of_images_tells_nothing_of_motion() -> None:
+    scene = make_scene(true_poses(), with_device=False)
+    poses = true_poses()
+    alone = replace(poses, camera1_from={name: poses.camera1_from[name] for name in ("pelvis", "femur")})
+    objects = {name: scene.objects[name] for name in ("pelvis", "femur")}
+    covariance = pose_covariance(replace(scene, objects=objects), alone, _LEVEL, GradNcc(1))
+    assert covariance.motions == ()
+    assert doubts_about_motion(covariance) == ()
