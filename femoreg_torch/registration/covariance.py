@@ -12,6 +12,10 @@ Hqx J with scores r = s_q + Jᵀ s_x, informs of q by S R⁻¹ S with R = Σ r r
 prior this gives a mean m and a covariance P of q. The intrinsics q0 that the poses were found with are off by
 P + (m − q0)(m − q0)ᵀ in the mean square, and the covariance of the poses is Hxx⁻¹ G Hxx⁻¹ + J (P + …) Jᵀ. So
 intrinsics that were refined count with what the images leave open, and others also with how badly the images fit them.
+
+Where the materials of a device were estimated, some of it is taken for what lies beside it
+(`registration.calibration`). These mistakes are nuisance parameters m too, of covariance 1, which the images have been
+asked for already: they add Hxx⁻¹ Hxm Hmx Hxx⁻¹.
 """
 
 from collections.abc import Sequence
@@ -22,6 +26,7 @@ from torch import Tensor
 
 from femoreg_torch.geometry import Poses
 from femoreg_torch.geometry.rigid import skew
+from femoreg_torch.optimize import Quadratic
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.intrinsics import Intrinsics, Profile, profile
 from femoreg_torch.registration.level import Level
@@ -128,12 +133,15 @@ def pose_covariance(
     moving: tuple[Moving, ...] = (*bodies, refined)
     costs = image_costs(scene, poses, moving, objects, images, level, similarity, imaging=imaging)
     rigid = 6 * len(bodies)
-    parts = costs.quadratics(torch.zeros(rigid + len(refined.free), dtype=torch.float64))
-    model = mean_quadratic(parts)
+    unsure = [(name, difference) for name in objects for difference in scene.objects[name].unsure]
+    parts = costs.quadratics(torch.zeros(rigid + len(refined.free), dtype=torch.float64), unsure)
+    every = mean_quadratic(parts)
+    model = _first(every, rigid + len(refined.free))
     inverse = torch.linalg.pinv(model.hessian[:rigid, :rigid], hermitian=True)
+    by_materials = inverse @ every.hessian[:rigid, len(model.hessian) :]
     clusters = len(model.scores) / (len(model.scores) - 1)
     scores = model.scores[:, :rigid]
-    by_images = clusters * inverse @ (scores.T @ scores) @ inverse
+    by_images = clusters * inverse @ (scores.T @ scores) @ inverse + by_materials @ by_materials.T
     of_intrinsics = profile(model, refined)
     mean, spread = _estimate(of_intrinsics, clusters, refined)
     response = of_intrinsics.answer + _slides(refined, poses, bodies)
@@ -152,6 +160,11 @@ def pose_covariance(
         -inverse @ model.gradient[:rigid],
         motions_between(scene, parts, images, objects, centres),
     )
+
+
+def _first(model: Quadratic, n: int) -> Quadratic:
+    """A model of its first n unknowns, the others staying as they are."""
+    return Quadratic(model.value, model.scores[:, :n], model.hessian[:n, :n])
 
 
 def _estimate(images: Profile, clusters: float, refined: Intrinsics) -> tuple[Tensor, Tensor]:

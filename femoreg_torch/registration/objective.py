@@ -16,6 +16,7 @@ from femoreg_torch.registration.scene import Body, Kind, Moving, RigidObject, Sc
 from femoreg_torch.registration.weights import Weighting, pixel_weights, prepared
 from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import FixedSimilarity, Similarity, similarity_quadratics
+from femoreg_torch.volume import Volume
 
 _STEP = 1e-5  # of a delta, for the derivatives of poses
 
@@ -114,9 +115,10 @@ class ImageCosts:
         """Costs (images,) of what stands still alone."""
         return torch.cat([target.cost(target.background[None]) for target in self.targets]).cpu()
 
-    def quadratics(self, delta: Tensor) -> list[Quadratic]:
+    def quadratics(self, delta: Tensor, unsure: Sequence[tuple[str, Volume]] = ()) -> list[Quadratic]:
         """Each image's cost about one delta (Σ n_b,), with exact gradient and positive semi-definite curvature.
 
+        The last unknowns are the amounts of what is `unsure`, differences that come to the volumes of objects by name.
         All of it on the CPU; a device is waited for once.
         """
         steps = _STEP * torch.eye(len(delta), dtype=torch.float64)
@@ -128,15 +130,20 @@ class ImageCosts:
         placed = [self._placed_with_rates(target, around, motions) for target in moving]
         # What was drawn already, image and Jacobian by view and object.
         seen: dict[tuple[int, str], tuple[Tensor, Tensor]] = {}
-        drawn = (self._drawn(target, delta, poses, seen) for target, (poses, _) in zip(moving, placed, strict=True))
+        drawn = (
+            self._drawn(target, delta, poses, seen, unsure) for target, (poses, _) in zip(moving, placed, strict=True)
+        )
         found = iter(zip(similarity_quadratics(drawn), placed, strict=True))
         models = []
         for target in self.targets:
             if target.moving:
                 (cost, scores, hessian), (_, twists) = next(found)
-                models.append(Quadratic(cost, scores @ twists, twists.T @ hessian @ twists))
+                amounts = torch.eye(len(unsure), dtype=torch.float64)
+                shown = amounts[[name in target.moving for name, _ in unsure]]
+                ways = torch.block_diag(twists, shown) if unsure else twists
+                models.append(Quadratic(cost, scores @ ways, ways.T @ hessian @ ways))
             else:
-                nothing = delta.new_zeros(len(delta), len(delta))
+                nothing = delta.new_zeros(len(delta) + len(unsure), len(delta) + len(unsure))
                 models.append(Quadratic(float(target.cost(target.background[None])), nothing[:1], nothing))
         return models
 
@@ -212,11 +219,17 @@ class ImageCosts:
         return every[:, 0], torch.cat(twists)
 
     def _drawn(
-        self, target: _Target, delta: Tensor, poses: Tensor, seen: dict[tuple[int, str], tuple[Tensor, Tensor]]
+        self,
+        target: _Target,
+        delta: Tensor,
+        poses: Tensor,
+        seen: dict[tuple[int, str], tuple[Tensor, Tensor]],
+        unsure: Sequence[tuple[str, Volume]],
     ) -> tuple[FixedSimilarity, Tensor, Tensor]:
-        """The similarity of an image, what is drawn at a delta (n,), and its changes (H, W, m) by the m twists.
+        """The similarity of an image, what is drawn at a delta (n,), and its changes (H, W, m).
 
-        What moves lies at `poses` (O, 4, 4). `seen` holds what was drawn already.
+        By the twists, and by what is `unsure` of what moves. That lies at `poses` (O, 4, 4). `seen` holds what was
+        drawn already.
         """
         drawn, jacobians = target.background, []
         camera = self._camera(target, delta[None])
@@ -238,6 +251,10 @@ class ImageCosts:
                 sliding = sliding.to(jacobian.device, non_blocking=True)
                 by_rays = by_rays + planes[6:] + torch.tensordot(sliding, planes[3:6], 1)
         jacobians += [by_rays] * len(refining)
+        for name, difference in unsure:
+            if name in target.moving:
+                place = poses[target.moving.index(name)][None, None]
+                jacobians.append(project([difference], place, camera, self.step_mm))
         changes = torch.cat(jacobians) * target.imaging.slope(drawn)
         return target.similarity, target.seen(drawn), changes.movedim(0, -1)
 

@@ -57,6 +57,17 @@ def touching_faces(owner: Tensor) -> Indices:
     return np.column_stack([pairs, faces])
 
 
+def mistakable(material: Indices, attenuation: Doubles, touching: Indices) -> tuple[Indices, Doubles]:
+    """Blocks (n,) that may be of the material of a block that they touch, and by how much they would attenuate more.
+
+    `material` numbers that of every block, with an `attenuation` each; `touching` are pairs of blocks, and faces.
+    """
+    pairs = np.concatenate([touching[:, :2], touching[:, 1::-1]])
+    pairs = np.column_stack([pairs[:, 0], material[pairs[:, 1]]])
+    block, other = np.unique(pairs[material[pairs[:, 0]] != pairs[:, 1]], axis=0).T
+    return block, attenuation[other] - attenuation[material[block]]
+
+
 @dataclass(frozen=True, eq=False)
 class RegionVoxels:
     """The voxels of a device that are not empty, region by region."""

@@ -36,10 +36,17 @@ class RigidObject:
     classes: tuple[int, ...] = ()  # of the segmentation that show it; none for what the network does not know
     parts: tuple[Volume, ...] = ()  # of a model, each of one material; on the grid of `volume`, which is their sum
     materials_known: bool = False  # whether materials were named; the HU of a single solid may be a guess
+    # differences of attenuation, 1/mm, of what was estimated: each comes in with an amount of mean 0 and variance 1
+    unsure: tuple[Volume, ...] = ()
 
     def to(self, device: torch.device) -> "RigidObject":
         """The same with its volumes on a device."""
-        return replace(self, volume=self.volume.to(device), parts=tuple(part.to(device) for part in self.parts))
+        return replace(
+            self,
+            volume=self.volume.to(device),
+            parts=tuple(part.to(device) for part in self.parts),
+            unsure=tuple(difference.to(device) for difference in self.unsure),
+        )
 
 
 @dataclass(frozen=True, eq=False)

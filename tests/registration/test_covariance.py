@@ -1,6 +1,7 @@
 """The covariance of a solution, against the spread of solutions over images drawn anew."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -65,3 +66,25 @@ def test_a_device_held_in_a_wrong_place_is_pulled_back(solutions: tuple[list[Pos
     torch.testing.assert_close(back, torch.tensor([-0.4, 0.3], dtype=torch.float64), atol=0.15, rtol=0)
     assert pulled.pull("device")[1] > settled.pull("device")[1]
     assert pulled.pull("pelvis")[1] < 0.15
+
+
+def test_what_is_unsure_of_a_device_counts_as_what_it_does_to_its_pose() -> None:
+    """The device's right half denser by a tenth, or not: against the step that the denser device would make."""
+    truth = true_poses()
+    scene = make_scene(truth, noise=0.0)
+    device = scene.objects["device"]
+    half = device.volume.data.clone()
+    half[..., : half.shape[2] // 2] = 0
+    difference = device.volume.with_data(0.1 * half)
+    denser = replace(device, volume=device.volume.with_data(device.volume.data + difference.data))
+    known, unsure, other = (
+        pose_covariance(replace(scene, objects=scene.objects | {"device": thing}), truth, _LEVEL, _SIMILARITY)
+        for thing in (device, replace(device, unsure=(difference,)), denser)
+    )
+    first = 6 * known.bodies.index("device")
+    added = (unsure.images - known.images)[first : first + 6, first : first + 6].diagonal().sqrt()
+    step = (other.step - known.step)[first : first + 6].abs()
+    assert float(added.norm()) == pytest.approx(float(step.norm()), rel=0.25)
+    assert float(added @ step) > 0.9 * float(added.norm() * step.norm())
+    pelvis = 6 * known.bodies.index("pelvis")
+    assert (unsure.images - known.images).diagonal()[pelvis : pelvis + 5].max() < 1e-3  # depth is common to all

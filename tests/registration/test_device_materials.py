@@ -11,7 +11,14 @@ from femoreg_torch.case import Start
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import CArm, Poses, about_point, centred_camera, exp_se3, pose_difference, rigid
 from femoreg_torch.registration.calibration import Calibration, fit_device
-from femoreg_torch.registration.regions import blocks_of, materials, region_paths, region_voxels, touching_faces
+from femoreg_torch.registration.regions import (
+    blocks_of,
+    materials,
+    mistakable,
+    region_paths,
+    region_voxels,
+    touching_faces,
+)
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.volume import Volume, axis_aligned, voxelise_mesh
 
@@ -86,6 +93,11 @@ def test_material_and_pose_of_a_device_that_is_told_as_one_solid(mixed: Scene) -
     assert max(fit.attenuations) > 6 * LIGHT
     of_rod, of_handle = (fit.volume.data[part.data > 0].median() for part in (ROD, HANDLE))
     assert of_rod > 5 * of_handle
+    assert fit.unsure
+    for difference in fit.unsure:  # what borders on another material may be of that; the rod's far end may not
+        end = difference.data[..., -20:]
+        assert float(end.abs().max()) == 0
+        assert float(difference.data.abs().max()) > 0
     for scattered in fit.scattered.values():
         assert scattered == pytest.approx(SCATTERED, rel=0.35)
 
@@ -94,6 +106,7 @@ def test_a_device_that_is_as_the_case_says_stays_so() -> None:
     scene = make_scene(0.15, 0.15)
     after, record = Calibration("materials").calibrate(scene, poses())
     assert torch.equal(after.objects["device"].volume.data, scene.objects["device"].volume.data)
+    assert after.objects["device"].unsure == ()
     assert pose_difference(poses().camera1_from["device"], record.poses.camera1_from["device"], POINT)[1] < 0.2
     assert record.moving == ("device",)
     assert "/mm" in record.stop
@@ -168,3 +181,11 @@ def test_few_materials() -> None:
     alike, one = materials(np.array([0.1, 0.12, 0.11]), np.array([1, 1, 1]))
     assert len(one) == 1
     assert set(alike) == {0}
+
+
+def test_blocks_that_may_be_of_the_material_beside() -> None:
+    """Four blocks in a row, the third of another material: the second may be that, and the third that of the others."""
+    touching = np.array([[0, 1, 9], [1, 2, 9], [2, 3, 9]])
+    block, more = mistakable(np.array([0, 0, 1, 0]), np.array([0.1, 0.7]), touching)
+    assert block.tolist() == [1, 2, 3]
+    assert more == pytest.approx([0.6, -0.6, 0.6])
