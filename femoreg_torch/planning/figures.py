@@ -43,7 +43,9 @@ def overlay_figure(prepared: Prepared, plan: FemoroplastyPlan) -> Figure:
     ends = femur.index(np.stack([plan.path.entry, plan.path.target]))
     figure = Figure(figsize=(14, 5.5), layout="constrained")
     names = ("R ← mm → L", "A ← mm → P", "mm → head")
-    for normal, (axis, plane) in enumerate(zip(figure.subplots(1, 3), _PLANES, strict=True)):
+    edges = femur.mask.shape * femur.spacing
+    panels = figure.subplots(1, 3, width_ratios=(edges[1], edges[0], edges[0]))
+    for normal, (axis, plane) in enumerate(zip(panels, _PLANES, strict=True)):
         across = [n for n in range(3) if n != normal]
         cut = tuple(middle[normal] if n == normal else slice(None) for n in range(3))
         size = [femur.mask.shape[n] * femur.spacing[n] for n in across]
@@ -98,10 +100,16 @@ def mesh_figure(rows: Sequence[MeshRow]) -> Figure:
     left, middle, right = figure.subplots(1, 3)
     size, load, gain = ([getattr(row, name) for row in rows] for name in ("size_mm", "baseline_n", "gain"))
     left.plot(size, load, "o-", color="#3b6ea5")
-    left.set(xlabel="elements, mm", ylabel="yield load without cement, N", ylim=(0, 1.15 * max(load)))
+    left.set(xlabel="elements, mm", ylabel="yield load without cement, N", ylim=(0, 1.15 * max(load)), xticks=size)
     middle.plot(size, [100 * value for value in gain], "o-", color="#c0602b")
-    middle.set(xlabel="elements, mm", ylabel="gain of the same cement, %", ylim=(0, 115 * max(gain)))
-    right.loglog([row.elements for row in rows], [row.seconds for row in rows], "o-", color="#444444")
+    middle.set(xlabel="elements, mm", ylabel="gain of the same cement, %", ylim=(0, 115 * max(gain)), xticks=size)
+    count, seconds = [row.elements for row in rows], [row.seconds for row in rows]
+    right.loglog(count, seconds, "o-", color="#444444")
     right.set(xlabel="elements", ylabel="processor time of one curve, s")
+    right.set_xticks(count, [f"{n}" for n in count])
+    right.set_yticks(seconds, [f"{t:.0f}" for t in seconds])
+    right.minorticks_off()
+    for axis in (left, middle, right):
+        axis.grid(alpha=0.3)
     figure.suptitle("The same femur and cement on finer meshes, modelled")
     return figure

@@ -6,17 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.calibration import Calibration, calibrate
 from femoreg_torch.planning.femur import Femur, cut_out
 from femoreg_torch.planning.laws import bone_material
+from femoreg_torch.planning.loading import make_loading
 from femoreg_torch.planning.mesh import blocks
 from femoreg_torch.planning.model import make_bone, make_model, with_cement
 from femoreg_torch.planning.settings import CalibrationSettings, Planning, load_planning
 from femoreg_torch.volume import Volume
 
 Solids = tuple[Volume, Volume, np.ndarray]
+UNCALIBRATED = Calibration("uncalibrated", 0.000887, 0.0633, {})
 RIGHT_KIND = {"rods": [], "mineral": "ha", "air_fat_muscle_mg_cc": (-840.0, -80.0, 30.0)}
 
 
@@ -65,21 +68,44 @@ def test_blocks_average_every_voxel_alike(femur: Femur) -> None:
     np.testing.assert_allclose(odd.mean(np.flip(femur.mask, 0)), np.flip(odd.mean(femur.mask), 0))
 
 
-def test_the_mesh_has_the_volume_of_the_label_and_the_surface_its_projection(femur: Femur, planning: Planning) -> None:
-    bone = make_bone(femur, Calibration("uncalibrated", 0.000887, 0.0633, {}), planning)
+def test_the_mesh_has_the_volume_of_the_label(femur: Femur, planning: Planning) -> None:
+    bone = make_bone(femur, UNCALIBRATED, planning)
     model = make_model(bone, planning, 4.0)
     kept = femur.mask.copy()
     z = np.arange(kept.shape[2]) * 2 + femur.lps_from_index[2, 3]
     kept[:, :, z < 130 - 95] = False
+    np.testing.assert_array_equal(model.voxels, kept)
     assert model.fill.sum() * 4**3 == pytest.approx(kept.sum() * 2**3, rel=0.02)
-    for direction in np.eye(3):
-        width = model.mesh.surface(direction).sum()
-        assert width == pytest.approx(model.mesh.surface(-direction).sum())
-        assert width >= kept.any(int(direction.argmax())).sum() * 4 * 0.99
+
+
+def test_what_is_shared_out_keeps_its_sum_and_its_middle(femur: Femur, planning: Planning) -> None:
+    mesh = make_model(make_bone(femur, UNCALIBRATED, planning), planning, 6.0).mesh
+    rng = np.random.default_rng(2)
+    points = mesh.centres[rng.integers(0, len(mesh.cells), 200)] + rng.uniform(-3, 3, (200, 3))
+    amounts = rng.random(200)
+    shared = mesh.shared(points, amounts)
+    assert shared.sum() == pytest.approx(amounts.sum())
+    np.testing.assert_allclose(shared @ mesh.points, amounts @ points)
+    beside = mesh.shared(mesh.points.max(0)[None] + 30, np.ones(1))
+    assert beside.sum() == pytest.approx(1)
+    assert beside.max() == pytest.approx(1)  # a corner of the nearest element
+
+
+def test_pads_are_those_of_the_bone_on_every_mesh(femur: Femur, planning: Planning) -> None:
+    """A sphere pressed on by a plane 6 mm beyond its top is met on a circle of π (r² − (r − 6)²)."""
+    bone = make_bone(femur, UNCALIBRATED, planning)
+    loadings = [make_loading(make_model(bone, planning, size), femur, planning.load) for size in (4.0, 5.0, 6.5)]
+    pad = planning.load.pad_modulus_mpa / planning.load.pad_thickness_mm
+    circle = np.pi * (22**2 - (22 - planning.load.pad_depth_mm) ** 2)
+    for loading in loadings:
+        assert loading.head.sum() / pad == pytest.approx(loadings[0].head.sum() / pad)
+        assert loading.trochanter.sum() == pytest.approx(loadings[0].trochanter.sum())
+        assert loading.span_mm == pytest.approx(loadings[0].span_mm)
+    assert loadings[0].head.sum() / pad == pytest.approx(circle, rel=0.15)  # voxels of 2 mm
 
 
 def test_cement_replaces_bone_voxel_by_voxel(femur: Femur, planning: Planning) -> None:
-    bone = make_bone(femur, Calibration("uncalibrated", 0.000887, 0.0633, {}), planning)
+    bone = make_bone(femur, UNCALIBRATED, planning)
     model = make_model(bone, planning, 4.0)
     none = with_cement(model, bone, np.zeros(femur.mask.shape), planning.cement)
     np.testing.assert_allclose(none.modulus, model.material.modulus)
@@ -104,6 +130,9 @@ def changed(labels: Volume, change: str) -> Volume:
         data[:32] = 0
     elif change == "empty":
         data[:] = 0
+    elif change == "shell":  # the cortex alone, with a gap of 2 mm in its medial wall
+        data[ndimage.binary_erosion(data.numpy(), iterations=2)] = 0
+        data[:, 20, :42] = 0
     return Volume(data, labels.lps_from_index)
 
 
@@ -116,6 +145,7 @@ def changed(labels: Volume, change: str) -> Volume:
         ("side", "cut off by the CT on the left"),
         ("short", "shows the left femur to 66 mm below"),
         ("empty", "no voxel of the left femur"),
+        ("shell", r"has holes of \d+ voxels .* marrow belongs to the label"),
     ],
 )
 def test_a_bad_label_is_told_in_one_line(solids: Solids, change: str, message: str) -> None:
@@ -125,6 +155,26 @@ def test_a_bad_label_is_told_in_one_line(solids: Solids, change: str, message: s
     with pytest.raises(InputError, match=message) as caught:
         cut_out(ct, bad, 1, head, "left", 95.0)
     assert "\n" not in str(caught.value)
+
+
+def test_a_whole_femur_gives_the_model_of_its_upper_end(solids: Solids, femur: Femur, planning: Planning) -> None:
+    """Another 300 mm of shaft with condyles: the same frame, box and mesh."""
+    ct, labels, head = solids
+    below = 150
+    more = labels.data[:1].repeat(below, 1, 1)
+    more[2:20, 6:34, 22:62] = 1  # condyles
+    more[0] = 0
+    lps = labels.lps_from_index.clone()
+    lps[2, 3] -= 2.0 * below
+    whole = Volume(torch.cat([more, labels.data]), lps)
+    found = cut_out(Volume(torch.cat([ct.data[:1].repeat(below, 1, 1), ct.data]), lps), whole, 1, head, "left", 95.0)
+    assert found.mask.shape == femur.mask.shape
+    np.testing.assert_allclose(found.lps_from_index, femur.lps_from_index)
+    np.testing.assert_array_equal(found.mask, femur.mask)
+    np.testing.assert_array_equal(found.hu, femur.hu)
+    assert found.corner[2] == femur.corner[2] + below
+    np.testing.assert_allclose(found.frame.proximal, femur.frame.proximal, atol=0.02)
+    np.testing.assert_allclose(found.frame.shaft, femur.frame.shaft, atol=0.5)
 
 
 def test_a_shaft_that_the_ct_cuts_askew_is_refused(solids: Solids) -> None:
