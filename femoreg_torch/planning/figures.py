@@ -13,6 +13,7 @@ from femoreg_torch.planning.offsets import Outcome
 from femoreg_torch.planning.plan import FemoroplastyPlan
 from femoreg_torch.planning.prepare import Prepared
 
+_LEAST_SPAN_POINTS = 4.0  # of an axis of gains: smaller differences lie within the error of the mesh
 _PLANES = ("sagittal", "coronal", "axial")  # by the index axis square to them
 
 
@@ -88,9 +89,13 @@ def robustness_figure(outcomes: Sequence[Outcome], baseline_n: float, planned_n:
     left.plot(distance, gains, "o", color="#3b6ea5")
     left.axhline(100 * (planned_n / baseline_n - 1), color="#c0602b", label="as planned")
     left.set(xlabel="error of the path, mm", ylabel="gain of yield load, %", title="Gain, modelled")
-    left.legend(loc="lower left")
+    low, high = left.get_ylim()
+    wider = max(0.0, _LEAST_SPAN_POINTS - (high - low)) / 2
+    left.set_ylim(low - wider, high + wider)
+    left.legend()
     right.hist([outcome.clearance_mm for outcome in outcomes], bins=15, color="#3b6ea5")
     right.set(xlabel="clearance of the path to the surface, mm", ylabel="draws", title="Clearance")
+    right.yaxis.get_major_locator().set_params(integer=True)
     return figure
 
 
