@@ -55,9 +55,9 @@ class Curve:
 class Press:
     """A femur under its pads: mesh, loading and the pattern of the matrix, which serve any material."""
 
-    def __init__(self, mesh: Mesh, loading: Loading, poisson: float) -> None:
+    def __init__(self, mesh: Mesh, loading: Loading, poisson: float, cap_modulus_mpa: float) -> None:
         self.mesh, self.loading = mesh, loading
-        self._poisson = poisson
+        self._poisson, self._cap_modulus = poisson, cap_modulus_mpa
         self._assembler = Assembler(mesh)
 
     def hardened(self, material: Material) -> Material:
@@ -65,7 +65,7 @@ class Press:
         caps = self.loading.caps
         never = np.full(len(caps), np.inf)
         return Material(
-            np.maximum(material.modulus, self.loading.cap_modulus),
+            np.where(caps, np.maximum(material.modulus, self._cap_modulus), material.modulus),
             np.where(caps, never, material.tension),
             np.where(caps, never, material.compression),
         )

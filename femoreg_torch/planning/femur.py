@@ -49,7 +49,7 @@ class Femur:
 
     side: Side
     hu: NDArray[np.float32]  # (X, Y, Z)
-    mask: Mask  # (X, Y, Z), the bone without holes; the box may cut its shaft
+    mask: Mask  # (X, Y, Z), one component without holes
     lps_from_index: Array  # (4, 4), of this box
     corner: tuple[int, int, int]  # of the box in the CT, voxels
     frame: Frame
@@ -110,23 +110,7 @@ def cut_out(ct: Volume, labels: Volume, bone: int, head: Array, side: Side, shaf
     frame = _frame(whole, affine, np.asarray(head, float), side, shaft_mm)
     if low[2] == 0:
         _check_shaft_end(whole[:, :, 0], affine, frame, side, shaft_mm)
-    return _shortened(Femur(side, hu, whole, affine, (low[0], low[1], low[2]), frame), shaft_mm)
-
-
-def _shortened(femur: Femur, shaft_mm: float) -> Femur:
-    """The part of a box that holds the bone down to so far below the head, and a margin.
-
-    So a scan of the whole thigh, condyles and all, gives the same model as one that ends with the shaft.
-    """
-    places = np.argwhere(femur.mask)
-    kept = places[(femur.points(places) - femur.frame.head) @ femur.frame.proximal >= -shaft_mm]
-    low = np.maximum(kept.min(0) - _MARGIN_VOXELS, 0)
-    box = tuple(slice(a, b + _MARGIN_VOXELS + 1) for a, b in zip(low, kept.max(0), strict=True))
-    affine = femur.lps_from_index.copy()
-    affine[:3, 3] += affine[:3, :3] @ low
-    corner = (femur.corner[0] + int(low[0]), femur.corner[1] + int(low[1]), femur.corner[2] + int(low[2]))
-    hu, mask = (np.ascontiguousarray(values[box]) for values in (femur.hu, femur.mask))
-    return Femur(femur.side, hu, mask, affine, corner, femur.frame)
+    return Femur(side, hu, whole, affine, (low[0], low[1], low[2]), frame)
 
 
 def _check_cut(box: tuple[slice, ...], shape: tuple[int, ...], side: Side) -> None:

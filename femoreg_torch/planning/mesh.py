@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.element import CORNERS
@@ -100,21 +99,23 @@ class Mesh:
         """Those (E,) of block values (BX, BY, BZ) that belong to elements."""
         return np.asarray(values[tuple(self.cells.T)])
 
-    def shared(self, points: Array, amounts: Array) -> Array:
-        """Amounts (M,) at points (M, 3), LPS mm, shared out to the nodes (N,) by the shape functions of their elements.
+    def surface(self, direction: Array) -> Array:
+        """Area (N,), mm², that each node bears of the surface which a unit vector (3,) along the index axes looks at.
 
-        What lies beside the mesh goes to the nearest element, or in equal parts to those that are alike near, so that a
-        mirrored mesh shares alike. Sums stay, and within the mesh first moments too.
+        Areas are projected along the vector, so that they add up to the true projection however the voxels step.
         """
-        places = (points - self.origin) @ self.axes / self.size_mm
-        distance, nearest = cKDTree(self.cells + 0.5).query(places, k=min(8, len(self.cells)))
-        near = distance <= distance[:, :1] + 1e-6
-        point, number = np.nonzero(near)
-        element = nearest[point, number]
-        within = np.clip(places[point] - self.cells[element], 0.0, 1.0)
-        shares = np.stack([np.where(corner, within, 1 - within).prod(1) for corner in CORNERS], axis=1)
-        shares *= (amounts / near.sum(1))[point, None]
-        return np.bincount(self.elements[element].ravel(), shares.ravel(), len(self.nodes))
+        area = np.zeros(len(self.nodes))
+        taken = np.zeros(self.cells.max(0) + 3, bool)  # a rim of free blocks all around
+        taken[tuple(self.cells.T + 1)] = True
+        for axis in range(3):
+            step = int(np.sign(direction[axis])) or 1
+            share = abs(direction[axis]) * self.size_mm**2 / 4
+            beside = self.cells.copy()
+            beside[:, axis] += step
+            free = ~taken[tuple(beside.T + 1)]
+            face = CORNERS[:, axis] == (step > 0)
+            np.add.at(area, self.elements[free][:, face].ravel(), share)
+        return area
 
 
 def mesh_of(size_mm: float, kept: NDArray[np.bool_], axes: Array, origin: Array) -> Mesh:

@@ -39,7 +39,6 @@ class Model:
 
     mesh: Mesh
     grid: Blocks
-    voxels: NDArray[np.bool_]  # (X, Y, Z) of the bone down to where the shaft is cut
     fill: Array
     ash: Array
     material: Material
@@ -95,7 +94,7 @@ def make_model(bone: Bone, planning: Planning, size_mm: float | None = None) -> 
     too_many(int(kept.sum()), settings.most_elements, size)
     mesh = mesh_of(size, kept, grid.lps_from_mm[:3, :3], grid.lps_from_mm[:3, 3])
     means = [mesh.of(grid.mean(np.where(kept_voxels, values, 0.0))) for values in (bone.ash, *_parts(bone.material))]
-    return Model(mesh, grid, kept_voxels, mesh.of(fill), means[0], Material(*means[1:]))
+    return Model(mesh, grid, mesh.of(fill), means[0], Material(*means[1:]))
 
 
 def with_cement(model: Model, bone: Bone, cement: NDArray, settings: CementSettings) -> Material:
