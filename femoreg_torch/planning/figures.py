@@ -5,6 +5,7 @@ from pathlib import Path as File
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from femoreg_torch.files import temporary_file
 from femoreg_torch.planning.convergence import MeshRow
@@ -44,7 +45,7 @@ def overlay_figure(prepared: Prepared, plan: FemoroplastyPlan) -> Figure:
     ends = femur.index(np.stack([plan.path.entry, plan.path.target]))
     figure = Figure(figsize=(14, 5.5), layout="constrained")
     names = ("R ← mm → L", "A ← mm → P", "mm → head")
-    edges = femur.mask.shape * femur.spacing
+    edges = np.array(femur.mask.shape) * femur.spacing
     panels = figure.subplots(1, 3, width_ratios=(edges[1], edges[0], edges[0]))
     for normal, (axis, plane) in enumerate(zip(panels, _PLANES, strict=True)):
         across = [n for n in range(3) if n != normal]
@@ -95,7 +96,7 @@ def robustness_figure(outcomes: Sequence[Outcome], baseline_n: float, planned_n:
     left.legend()
     right.hist([outcome.clearance_mm for outcome in outcomes], bins=15, color="#3b6ea5")
     right.set(xlabel="clearance of the path to the surface, mm", ylabel="draws", title="Clearance")
-    right.yaxis.get_major_locator().set_params(integer=True)
+    right.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
 
 

@@ -107,7 +107,7 @@ def changed(labels: Volume, change: str) -> Volume:
     elif change == "empty":
         data[:] = 0
     elif change == "shell":  # the cortex alone, with a gap of 2 mm in its medial wall
-        data[ndimage.binary_erosion(data.numpy(), iterations=2)] = 0
+        data[torch.from_numpy(ndimage.binary_erosion(data.numpy(), iterations=2))] = 0
         data[:, 20, :42] = 0
     return Volume(data, labels.lps_from_index)
 
