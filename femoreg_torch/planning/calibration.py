@@ -37,7 +37,8 @@ def calibrate(hu: NDArray[np.float32], settings: CalibrationSettings) -> Calibra
     """The calibration of a CT (X, Y, Z) in HU.
 
     Internal: the line through the peaks of air, fat and muscle in the histogram of the whole CT (Eggermont et al. 2019,
-    PLoS ONE 14:e0220564). Uncalibrated: HU are taken for mg/cc of hydroxyapatite, which holds for no scanner exactly.
+    PLoS ONE 14:e0220564); their densities are settings whose defaults no source confirmed. Uncalibrated: HU are taken
+    for mg/cc of hydroxyapatite, which holds for no scanner exactly.
     Raises `InputError` if a peak is missing or density does not rise with HU.
     """
     references: dict[str, tuple[float, float]] = {}

@@ -18,6 +18,7 @@ Mask = NDArray[np.bool_]
 
 _SPECK_SHARE = 0.01  # of the label: more, apart from the rest, is a second bone
 _HOLE_SHARE = 0.02  # of the label: more, enclosed in slices, is marrow that was left out
+_GAP_MM = 2.0  # gaps of a cortex so wide are closed before it is asked whether it is a shell
 _MARGIN_VOXELS = 4  # around the bone
 SHAFT_FROM_MM = 70.0  # below the head's centre: there the shaft is a tube (about 10 mm below the lesser trochanter)
 _LEAST_SHAFT_MM = 20.0  # of such a tube, to know its axis
@@ -102,7 +103,7 @@ def cut_out(ct: Volume, labels: Volume, bone: int, head: Array, side: Side, shaf
     low = [max(part.start - _MARGIN_VOXELS, 0) for part in box]
     high = [min(part.stop + _MARGIN_VOXELS, size) for part, size in zip(box, mask.shape, strict=True)]
     box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    whole = _one_piece(mask[box], side)
+    whole = _one_piece(mask[box], ct.lps_from_index.numpy(), side)
     hu = np.ascontiguousarray(ct.data.numpy().transpose(2, 1, 0)[box]).astype(np.float32)
     affine = ct.lps_from_index.numpy().copy()
     affine[:3, 3] += affine[:3, :3] @ np.array(low, float)
@@ -139,8 +140,11 @@ def _check_shaft_end(end: Mask, affine: Array, frame: Frame, side: Side, shaft_m
         )
 
 
-def _one_piece(mask: Mask, side: Side) -> Mask:
-    """The largest component, holes filled, if what it leaves out and fills is little."""
+def _one_piece(mask: Mask, affine: Array, side: Side) -> Mask:
+    """The largest component, holes filled, if what it leaves out and fills is little.
+
+    Holes count with gaps of the bone around them closed: a label of the cortex alone has gaps where that is thin.
+    """
     pieces, count = ndimage.label(mask)
     sizes = np.bincount(pieces.ravel())[1:]
     largest = int(sizes.argmax()) + 1
@@ -149,14 +153,28 @@ def _one_piece(mask: Mask, side: Side) -> Mask:
             f"label map: the {side} femur has {count} pieces, the second holds {np.sort(sizes)[-2]} voxels. Keep one."
         )
     kept = pieces == largest
-    filled = np.stack([ndimage.binary_fill_holes(kept[:, :, z]) for z in range(kept.shape[2])], axis=2)
-    holes = int((filled & ~kept).sum())
+    closed = _closed(kept, np.linalg.norm(affine[:3, :3], axis=0))
+    holes = int((_filled(closed) & ~closed).sum())
     if holes > _HOLE_SHARE * kept.sum():
         raise InputError(
             f"label map: the {side} femur has holes of {holes} voxels ({100 * holes / kept.sum():.0f} % of it). Fill "
             "them: marrow belongs to the label."
         )
-    return filled
+    return _filled(kept)
+
+
+def _filled(mask: Mask) -> Mask:
+    """With what is enclosed in each slice."""
+    return np.stack([ndimage.binary_fill_holes(mask[:, :, z]) for z in range(mask.shape[2])], axis=2)
+
+
+def _closed(mask: Mask, spacing: Array) -> Mask:
+    """Gaps up to `_GAP_MM` within slices closed."""
+    reach = np.ceil(_GAP_MM / 2 / spacing[:2]).astype(int)
+    ball = np.ones((2 * reach[0] + 1, 2 * reach[1] + 1, 1), bool)
+    padded = np.pad(mask, [(int(reach[0]),) * 2, (int(reach[1]),) * 2, (0, 0)])
+    closed = ndimage.binary_closing(padded, ball)
+    return np.asarray(closed[reach[0] : -reach[0], reach[1] : -reach[1]])
 
 
 def _frame(mask: Mask, affine: Array, head: Array, side: Side, shaft_mm: float) -> Frame:
@@ -195,6 +213,6 @@ def _frame(mask: Mask, affine: Array, head: Array, side: Side, shaft_mm: float) 
 
 def _too_short(side: Side, lowest: float, shaft_mm: float) -> InputError:
     return InputError(
-        f"CT: it shows the {side} femur to {-lowest:.0f} mm below the centre of its head, but "
-        f"{max(shaft_mm, SHAFT_FROM_MM + _LEAST_SHAFT_MM):.0f} mm are needed. Use a longer scan."
+        f"CT: its label shows the {side} femur to {-lowest:.0f} mm below the centre of its head, but "
+        f"{max(shaft_mm, SHAFT_FROM_MM + _LEAST_SHAFT_MM):.0f} mm are needed. Use a longer scan, or label more of it."
     )

@@ -5,6 +5,7 @@ from pathlib import Path as File
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from femoreg_torch.files import temporary_file
 from femoreg_torch.planning.convergence import MeshRow
@@ -13,6 +14,7 @@ from femoreg_torch.planning.offsets import Outcome
 from femoreg_torch.planning.plan import FemoroplastyPlan
 from femoreg_torch.planning.prepare import Prepared
 
+_LEAST_SPAN_POINTS = 4.0  # of an axis of gains: smaller differences lie within the error of the mesh
 _PLANES = ("sagittal", "coronal", "axial")  # by the index axis square to them
 
 
@@ -43,7 +45,9 @@ def overlay_figure(prepared: Prepared, plan: FemoroplastyPlan) -> Figure:
     ends = femur.index(np.stack([plan.path.entry, plan.path.target]))
     figure = Figure(figsize=(14, 5.5), layout="constrained")
     names = ("R ← mm → L", "A ← mm → P", "mm → head")
-    for normal, (axis, plane) in enumerate(zip(figure.subplots(1, 3), _PLANES, strict=True)):
+    edges = np.array(femur.mask.shape) * femur.spacing
+    panels = figure.subplots(1, 3, width_ratios=(edges[1], edges[0], edges[0]))
+    for normal, (axis, plane) in enumerate(zip(panels, _PLANES, strict=True)):
         across = [n for n in range(3) if n != normal]
         cut = tuple(middle[normal] if n == normal else slice(None) for n in range(3))
         size = [femur.mask.shape[n] * femur.spacing[n] for n in across]
@@ -86,9 +90,13 @@ def robustness_figure(outcomes: Sequence[Outcome], baseline_n: float, planned_n:
     left.plot(distance, gains, "o", color="#3b6ea5")
     left.axhline(100 * (planned_n / baseline_n - 1), color="#c0602b", label="as planned")
     left.set(xlabel="error of the path, mm", ylabel="gain of yield load, %", title="Gain, modelled")
-    left.legend(loc="lower left")
+    low, high = left.get_ylim()
+    wider = max(0.0, _LEAST_SPAN_POINTS - (high - low)) / 2
+    left.set_ylim(low - wider, high + wider)
+    left.legend()
     right.hist([outcome.clearance_mm for outcome in outcomes], bins=15, color="#3b6ea5")
     right.set(xlabel="clearance of the path to the surface, mm", ylabel="draws", title="Clearance")
+    right.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
 
 
@@ -98,10 +106,16 @@ def mesh_figure(rows: Sequence[MeshRow]) -> Figure:
     left, middle, right = figure.subplots(1, 3)
     size, load, gain = ([getattr(row, name) for row in rows] for name in ("size_mm", "baseline_n", "gain"))
     left.plot(size, load, "o-", color="#3b6ea5")
-    left.set(xlabel="elements, mm", ylabel="yield load without cement, N", ylim=(0, 1.15 * max(load)))
+    left.set(xlabel="elements, mm", ylabel="yield load without cement, N", ylim=(0, 1.15 * max(load)), xticks=size)
     middle.plot(size, [100 * value for value in gain], "o-", color="#c0602b")
-    middle.set(xlabel="elements, mm", ylabel="gain of the same cement, %", ylim=(0, 115 * max(gain)))
-    right.loglog([row.elements for row in rows], [row.seconds for row in rows], "o-", color="#444444")
+    middle.set(xlabel="elements, mm", ylabel="gain of the same cement, %", ylim=(0, 115 * max(gain)), xticks=size)
+    count, seconds = [row.elements for row in rows], [row.seconds for row in rows]
+    right.loglog(count, seconds, "o-", color="#444444")
     right.set(xlabel="elements", ylabel="processor time of one curve, s")
+    right.set_xticks(count, [f"{n}" for n in count])
+    right.set_yticks(seconds, [f"{t:.0f}" for t in seconds])
+    right.minorticks_off()
+    for axis in (left, middle, right):
+        axis.grid(alpha=0.3)
     figure.suptitle("The same femur and cement on finer meshes, modelled")
     return figure

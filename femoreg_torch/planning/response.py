@@ -52,7 +52,8 @@ class Response:
     def under(self, covariance: Array) -> "Quoted":
         """The gain under normal errors of mean 0 and a covariance (6, 6), mm and degrees.
 
-        Exact for a quadratic: E = g + tr(C Σ) / 2, Var = b′ Σ b + tr(C Σ C Σ) / 2 (Searle, Linear Models, 1971, ch. 2).
+        Exact for a quadratic: E = g + tr(C Σ) / 2, Var = b′ Σ b + tr(C Σ C Σ) / 2. That is var(x′Ax) = 2 tr(AΣAΣ) with
+        A = C / 2 (Searle, Linear Models, 1971, p. 57); a linear term adds b′Σb, as odd moments vanish at mean 0.
         """
         spread = self.by_motion() @ np.asarray(covariance, float) @ self.by_motion().T
         bent = self.curvature[:, None] * spread

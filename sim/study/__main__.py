@@ -290,6 +290,8 @@ def plans(
 ) -> int:
     """Plan cement for three femora, move the plans, compare meshes; goes on where it was stopped.
 
+    What is in OUT counts as done, by whichever version: after a change of the model, name an empty folder.
+
     Args:
         first: only the first so many femora.
         meshes: compare meshes on the first femur.

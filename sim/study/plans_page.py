@@ -24,8 +24,9 @@ without labels, and were cut out by threshold, the head by a sphere placed by ey
 by air, fat and muscle with densities that are not confirmed; the third, where a tumour hides the peak of muscle, is not
 calibrated at all."""
 _LAWS_TOLD = """Beside them: femora of 54 donors of 79 ± 11 years, tested in a fall on the trochanter, failed at 3951 ±
-1659 N (doi 10.1359/JBMR.0301247, abstract). Fracture loads in stance and in a fall go together (r = 0.90, 17 pairs;
-Keyak 2000, J Biomech 33:499, abstract); no mean load in stance could be read. Yield comes before failure."""
+1659 N (doi 10.1359/JBMR.0301247, abstract). Fracture loads in stance and in a fall go together (r = 0.901, 17 pairs;
+abstract at wbldb.lievers.net/10200690.html). No source with a mean load in stance could be read, so the loads in stance
+stand without a comparison. Yield comes before failure."""
 _COMPARABLE = """The paper's row is one osteoporotic specimen under a model whose mesh, materials and supports were
 not published. **Compare** the order of the gain, and what 4 mm cost in points. **Do not compare** loads in N with it:
 these are other bones, and supports alone move a load by a factor of two. Between the other rows settings are equal, so

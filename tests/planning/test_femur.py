@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.calibration import Calibration, calibrate
@@ -17,6 +18,7 @@ from femoreg_torch.planning.settings import CalibrationSettings, Planning, load_
 from femoreg_torch.volume import Volume
 
 Solids = tuple[Volume, Volume, np.ndarray]
+UNCALIBRATED = Calibration("uncalibrated", 0.000887, 0.0633, {})
 RIGHT_KIND = {"rods": [], "mineral": "ha", "air_fat_muscle_mg_cc": (-840.0, -80.0, 30.0)}
 
 
@@ -66,7 +68,7 @@ def test_blocks_average_every_voxel_alike(femur: Femur) -> None:
 
 
 def test_the_mesh_has_the_volume_of_the_label_and_the_surface_its_projection(femur: Femur, planning: Planning) -> None:
-    bone = make_bone(femur, Calibration("uncalibrated", 0.000887, 0.0633, {}), planning)
+    bone = make_bone(femur, UNCALIBRATED, planning)
     model = make_model(bone, planning, 4.0)
     kept = femur.mask.copy()
     z = np.arange(kept.shape[2]) * 2 + femur.lps_from_index[2, 3]
@@ -79,7 +81,7 @@ def test_the_mesh_has_the_volume_of_the_label_and_the_surface_its_projection(fem
 
 
 def test_cement_replaces_bone_voxel_by_voxel(femur: Femur, planning: Planning) -> None:
-    bone = make_bone(femur, Calibration("uncalibrated", 0.000887, 0.0633, {}), planning)
+    bone = make_bone(femur, UNCALIBRATED, planning)
     model = make_model(bone, planning, 4.0)
     none = with_cement(model, bone, np.zeros(femur.mask.shape), planning.cement)
     np.testing.assert_allclose(none.modulus, model.material.modulus)
@@ -104,6 +106,9 @@ def changed(labels: Volume, change: str) -> Volume:
         data[:32] = 0
     elif change == "empty":
         data[:] = 0
+    elif change == "shell":  # the cortex alone, with a gap of 2 mm in its medial wall
+        data[torch.from_numpy(ndimage.binary_erosion(data.numpy(), iterations=2))] = 0
+        data[:, 20, :42] = 0
     return Volume(data, labels.lps_from_index)
 
 
@@ -116,6 +121,7 @@ def changed(labels: Volume, change: str) -> Volume:
         ("side", "cut off by the CT on the left"),
         ("short", "shows the left femur to 66 mm below"),
         ("empty", "no voxel of the left femur"),
+        ("shell", r"has holes of \d+ voxels .* marrow belongs to the label"),
     ],
 )
 def test_a_bad_label_is_told_in_one_line(solids: Solids, change: str, message: str) -> None:
@@ -125,6 +131,24 @@ def test_a_bad_label_is_told_in_one_line(solids: Solids, change: str, message: s
     with pytest.raises(InputError, match=message) as caught:
         cut_out(ct, bad, 1, head, "left", 95.0)
     assert "\n" not in str(caught.value)
+
+
+def test_a_whole_femur_is_taken_by_its_upper_end(solids: Solids, femur: Femur, planning: Planning) -> None:
+    """Another 300 mm of shaft with condyles: the same frame, and elements down to the same level."""
+    ct, labels, head = solids
+    below = 150
+    more = labels.data[:1].repeat(below, 1, 1)
+    more[2:20, 6:34, 22:62] = 1  # condyles
+    more[0] = 0
+    lps = labels.lps_from_index.clone()
+    lps[2, 3] -= 2.0 * below
+    whole = Volume(torch.cat([more, labels.data]), lps)
+    found = cut_out(Volume(torch.cat([ct.data[:1].repeat(below, 1, 1), ct.data]), lps), whole, 1, head, "left", 95.0)
+    np.testing.assert_allclose(found.frame.proximal, femur.frame.proximal, atol=0.02)
+    np.testing.assert_allclose(found.frame.shaft, femur.frame.shaft, atol=0.5)
+    short, long = (make_model(make_bone(each, UNCALIBRATED, planning), planning, 4.0) for each in (femur, found))
+    assert long.fill.sum() == pytest.approx(short.fill.sum(), rel=0.01)
+    assert long.mesh.points[:, 2].min() == pytest.approx(short.mesh.points[:, 2].min(), abs=4)
 
 
 def test_a_shaft_that_the_ct_cuts_askew_is_refused(solids: Solids) -> None:
