@@ -22,14 +22,15 @@ from samples import samples_of_a_registration
 
 _COMMAND = "import sys; from femoreg_torch.commands.main import main; sys.exit(main())"
 _IMPORTS = "import femoreg_torch.commands.register, femoreg_torch.registration.run, femoreg_torch.evaluation"
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+_THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")  # NumPy's are a matter of the command
 
 Seconds = dict[str, float]
 
 
 def environment(cores: int) -> dict[str, str]:
-    """That of this process, with so many threads."""
-    return os.environ | dict.fromkeys(_THREADS, str(cores))
+    """That of this process, with so many threads; Python keeps compiled modules, as it does for users."""
+    kept = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    return kept | dict.fromkeys(_THREADS, str(cores))
 
 
 def timed(arguments: list[str], cores: int) -> tuple[float, float]:
