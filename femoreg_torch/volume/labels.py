@@ -1,6 +1,7 @@
 """Where the structures of a label map are."""
 
 from collections.abc import Sequence
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -20,7 +21,7 @@ _Boxes = list[tuple[slice, slice, slice] | None]
 _boxes: WeakKeyDictionary[Volume, tuple[int, _Boxes]] = WeakKeyDictionary()
 
 
-def looked_up(table: NDArray, labels: NDArray) -> NDArray:
+def looked_up(table: NDArray[Any], labels: NDArray[Any]) -> NDArray[Any]:
     """The entries of a table (n,) that labels (Z, Y, X) of whole numbers below n stand for.
 
     OpenCV looks bytes up ten times as fast as NumPy.
@@ -29,7 +30,7 @@ def looked_up(table: NDArray, labels: NDArray) -> NDArray:
         return table[labels]
     whole = np.zeros(256, table.dtype)
     whole[: len(table)] = table[:256]
-    return cv2.LUT(np.ascontiguousarray(labels).reshape(len(labels), -1), whole).reshape(labels.shape)
+    return np.asarray(cv2.LUT(np.ascontiguousarray(labels).reshape(len(labels), -1), whole)).reshape(labels.shape)
 
 
 def label_box(labels: Volume, ids: Sequence[int]) -> tuple[Corner, Corner]:
