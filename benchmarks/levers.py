@@ -7,15 +7,18 @@ together, of the fastest turn; `apart` is the largest difference of the two resu
 """
 
 import argparse
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from measure import machine, table, write_section
 from samples import samples
+from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.case import read_case
@@ -23,19 +26,24 @@ from femoreg_torch.drr import cpu, project, project_with_jacobian
 from femoreg_torch.drr.bricks import BrickedVolume, bricked
 from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import Poses, about_point, exp_se3, transform_points
+from femoreg_torch.optimize import levenberg
 from femoreg_torch.registration import Scene, Stage, load_plan, prepare_scene
 from femoreg_torch.registration.imaging import tissue_integrals
 from femoreg_torch.registration.level import Level, binning
 from femoreg_torch.registration.objective import ImageCosts, image_costs
 from femoreg_torch.registration.scene import Body
+from femoreg_torch.registration.stage import run_stage
 from femoreg_torch.registration.step import chosen_kinds, chosen_objects
 from femoreg_torch.registration.weights import prepared
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.similarity.curvature import patch_curvature
 from femoreg_torch.similarity.kernels import image_gradients
+from femoreg_torch.volume import looked_up
+from femoreg_torch.volume.attenuation import _dilated
 
 _CANDIDATES = 8
 _STEP = 1e-4
+_START_OFF = torch.tensor([0.02, -0.02, 0.01, 4.0, -3.0, 12.0], dtype=torch.float64)  # of view 2: rad and mm
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,8 @@ def levers(scene: Scene, poses: Poses) -> Iterator[Lever]:
     yield from _of_the_projector(scene, poses)
     yield from _of_the_objective(scene, poses)
     yield from _of_the_similarity(scene, poses)
+    yield from _of_the_descents(scene, poses)
+    yield from _of_the_reading(scene)
 
 
 def _of_the_projector(scene: Scene, poses: Poses) -> Iterator[Lever]:
@@ -100,6 +110,15 @@ def _of_the_projector(scene: Scene, poses: Poses) -> Iterator[Lever]:
             cpu._packet_edges = edges
 
     yield Lever("rays go in packets", "one image, 384²", single, lambda: cast(bricks))
+
+    for fewer, step_mm in ((8, 2.0), (16, 4.0)):
+        coarse, fitting = scene.carm.camera.downsampled(fewer), Level(1.0, step_mm).volume(volume)
+        yield Lever(
+            f"voxels of {max(fitting.spacing_mm):.0f} mm, as large as the steps allow",
+            f"one image, {coarse.shape[0]}²",
+            partial(project, volume, pose, coarse, step_mm),
+            partial(project, fitting, pose, coarse, step_mm),
+        )
 
     centre = transform_points(pose[0], volume.centre()[None])[0]
     steps = _STEP * torch.eye(6, dtype=torch.float64)
@@ -235,6 +254,61 @@ def _of_the_similarity(scene: Scene, poses: Poses) -> Iterator[Lever]:
         "one image, 384²",
         plain,
         lambda: torch.autograd.grad(fixed(moving)[0], moving)[0],
+    )
+    yield Lever(
+        "and in one pass",
+        "one image, 384²",
+        lambda: torch.autograd.grad(fixed(moving)[0], moving)[0],
+        lambda: fixed._with_slope(image)[1],
+    )
+
+
+def _of_the_descents(scene: Scene, poses: Poses) -> Iterator[Lever]:
+    stage = stage_named("C-arm of the other views, coarse")
+    isocentre = torch.tensor(scene.carm.isocentre_mm, dtype=torch.float64)
+    moved = about_point(exp_se3(_START_OFF[None]), isocentre)[0]
+    off = poses.with_view(1, moved @ poses.camera_from_camera1[1])
+
+    def found() -> Tensor:
+        return run_stage(scene, off, stage, (1,), seed=0).poses.camera_from_camera1[1]
+
+    def with_constant(name: str, value: float) -> Tensor:
+        kept = getattr(levenberg, name)
+        setattr(levenberg, name, value)
+        try:
+            return found()
+        finally:
+            setattr(levenberg, name, kept)
+
+    yield Lever(
+        "a descent that comes where another ended is given up",
+        "coarse C-arm of a view",
+        lambda: with_constant("_SAME", 0.0),
+        found,
+    )
+    yield Lever(
+        "a descent ends where three evaluations gain nothing",
+        "coarse C-arm of a view",
+        lambda: with_constant("_STALLED", -math.inf),
+        found,
+    )
+
+
+def _of_the_reading(scene: Scene) -> Iterator[Lever]:
+    bone = (scene.objects["pelvis"].volume.data > 0).numpy()
+    labels, table = bone.astype(np.uint8), np.arange(256, dtype=np.float32)
+    yield Lever(
+        "labels are looked up by OpenCV, not by NumPy",
+        "labels about the pelvis",
+        lambda: torch.from_numpy(table[labels]),
+        lambda: torch.from_numpy(looked_up(table, labels)),
+    )
+    inside = ndimage.binary_erosion(bone, iterations=2)
+    yield Lever(
+        "masks of bones grow by shifts, not by SciPy's dilation",
+        "the pelvis",
+        lambda: torch.from_numpy(ndimage.binary_dilation(inside, iterations=2, mask=bone)),
+        lambda: torch.from_numpy(_dilated(inside, bone, 2)),
     )
 
 

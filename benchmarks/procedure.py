@@ -22,18 +22,19 @@ from samples import samples_of_a_registration
 
 _COMMAND = "import sys; from femoreg_torch.commands.main import main; sys.exit(main())"
 _IMPORTS = "import femoreg_torch.commands.register, femoreg_torch.registration.run, femoreg_torch.evaluation"
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+_THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")  # NumPy's are a matter of the command
 
 Seconds = dict[str, float]
 
 
 def environment(cores: int) -> dict[str, str]:
-    """That of this process, with so many threads."""
-    return os.environ | dict.fromkeys(_THREADS, str(cores))
+    """That of this process, with so many threads; Python keeps compiled modules, as it does for users."""
+    kept = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    return kept | dict.fromkeys(_THREADS, str(cores))
 
 
-def timed(arguments: list[str], cores: int) -> tuple[float, float]:
-    """Seconds of a process on the first `cores` cores, and the most memory it held, MiB."""
+def timed(arguments: list[str], cores: int) -> tuple[float, float, float]:
+    """Seconds of a process on the first `cores` cores, those of the processor, and the most memory it held, MiB."""
     available = sorted(os.sched_getaffinity(0))[:cores]
     began = time.perf_counter()
     process = subprocess.Popen(
@@ -45,16 +46,16 @@ def timed(arguments: list[str], cores: int) -> tuple[float, float]:
     _, status, used = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(arguments[-4:])}: ended with status {os.waitstatus_to_exitcode(status)}.")
-    return time.perf_counter() - began, used.ru_maxrss / 1024
+    return time.perf_counter() - began, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
 
 
 def one_run(case: Path, cores: int) -> tuple[Seconds, dict[str, int], float]:
     """Seconds by part of one run of the command, evaluations by stage, and the most memory, MiB."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        whole, peak = timed([sys.executable, "-c", _COMMAND, "register", str(case), "--out", str(out)], cores)
+        whole, busy, peak = timed([sys.executable, "-c", _COMMAND, "register", str(case), "--out", str(out)], cores)
         result = json.loads((out / "result.json").read_text(encoding="utf-8"))
-    imports, _ = timed([sys.executable, "-c", _IMPORTS], cores)
+    imports, _, _ = timed([sys.executable, "-c", _IMPORTS], cores)
     told = result["timings_s"]
     parts = {"start of Python and imports": imports, "reading": told["reading"], "detection": told["detection"]}
     evaluations = {}
@@ -65,7 +66,7 @@ def one_run(case: Path, cores: int) -> tuple[Seconds, dict[str, int], float]:
     parts["between stages"] = told["registration"] - sum(stage["seconds"] for stage in result["stages"])
     parts["quality"] = told["quality"]
     parts["the case's files, writing, end"] = whole - imports - told["total"]
-    return parts | {"**whole command**": whole}, evaluations, peak
+    return parts | {"**whole command**": whole, "time of the processor, all threads": busy}, evaluations, peak
 
 
 def main() -> None:

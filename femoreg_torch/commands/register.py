@@ -50,6 +50,10 @@ def register(
         device: Where volumes and images lie, and are drawn and compared: cpu, cuda (the first GPU), or auto, a GPU
             where there is one. Run `femoreg doctor` before you trust a GPU.
     """
+    import os
+
+    # NumPy and SciPy see only small matrices here, in loops: threads that wait for each other cost more than they save.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from rich.console import Console
     from rich.markup import escape
 

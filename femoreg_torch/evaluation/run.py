@@ -9,8 +9,6 @@ from femoreg_torch.case import Case, Result, new_folder
 from femoreg_torch.evaluation.errors import errors, reference_points
 from femoreg_torch.evaluation.fit import check_fits
 from femoreg_torch.evaluation.overlay import draw, overlay_figure
-from femoreg_torch.evaluation.report import report_page
-from femoreg_torch.evaluation.report.pictures import PANEL_PX
 from femoreg_torch.files import write_json, write_text
 from femoreg_torch.registration import Scene, prepare_scene
 
@@ -32,6 +30,10 @@ def write_report(case: Case, result: Result, run: Path) -> dict[str, Any] | None
 
     Returns the errors. Raises `InputError` if the result does not fit the case.
     """
+    # Here, as `register` needs none of it and would load it for nothing.
+    from femoreg_torch.evaluation.report import report_page
+    from femoreg_torch.evaluation.report.pictures import PANEL_PX
+
     check_fits(case, result)
     scene = prepare_scene(case)
     found = evaluate(case, result, scene)
@@ -49,6 +51,9 @@ def write_report(case: Case, result: Result, run: Path) -> dict[str, Any] | None
 
 def evaluation_page(case: Case, result: Result) -> str:
     """The report alone, as text. Raises `InputError` if the result does not fit the case."""
+    from femoreg_torch.evaluation.report import report_page
+    from femoreg_torch.evaluation.report.pictures import PANEL_PX
+
     check_fits(case, result)
     scene = prepare_scene(case)
     found = evaluate(case, result, scene)

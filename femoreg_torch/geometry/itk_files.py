@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import SimpleITK as sitk
 import torch
-from scipy.io import loadmat
 from torch import Tensor
 
 from femoreg_torch.arrays import quiet
@@ -93,6 +92,8 @@ def _of_text(content: str) -> tuple[str, int, int]:
 
 def _of_matlab(content: bytes) -> tuple[str, int, int]:
     """As `_of_text`, of a MATLAB file. Raises `ValueError`."""
+    from scipy.io import loadmat  # here, as it is slow to load and most cases have no such file
+
     found = {name: value for name, value in loadmat(io.BytesIO(content)).items() if not name.startswith("__")}
     (kind,) = (name for name in found if name != "fixed")
     if not all(np.isfinite(np.asarray(value, dtype=float)).all() for value in found.values()):

@@ -1,5 +1,6 @@
 """Levenberg–Marquardt: steps of second order, damped until they improve; from one start or from the best of many."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,6 +15,10 @@ _LEAST_DAMPING = 1e-7
 _MOST_DAMPING = 1e4
 _SOFT = 5  # directions that are looked along for the bottom of a valley
 _FLAT = 1e-9  # second difference of values that is none
+_SAME = (
+    0.25  # units of the scales: a descent that comes so near to where an earlier one ended, and lies higher, joins it
+)
+_PATIENCE, _STALLED = 3, 10.0  # a descent ends when so many evaluations together gained less than so many `tol_f`
 
 
 @dataclass(frozen=True)
@@ -22,7 +27,10 @@ class LevenbergMarquardt:
 
     K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, DTU 2004, algorithm 3.16.
     With `candidates`, so many random deltas of deviation one are looked at first, and the best `starts` of them and
-    zero are refined; the search ends with the best of these.
+    zero are refined; the search ends with the best of these. One that comes where an earlier one ended, and fits no
+    better, is given up: it would end there too.
+    A descent also ends where three evaluations together gain less than ten `tol_f`: an objective that is drawn from
+    voxels ripples, and its ripples promise steps that they do not keep.
 
     An objective that is drawn from voxels ripples. Where it is soft, ripples hold a descent up well before the minimum
     of what lies beneath. With `valley` the search goes on: along each of the five directions of least curvature, to the
@@ -61,7 +69,10 @@ class LevenbergMarquardt:
             drawn = torch.randn(self.candidates, n, generator=generator, dtype=torch.float64)
             tried = torch.cat([starts, drawn])
             starts = tried[track(tried).argsort()[: self.starts]]
-        found = [_descend(track, objective, start, self) for start in starts]
+        found: list[_End] = []
+        for start in starts:
+            end = _descend(track, objective, start, self, found)
+            found += [] if end is None else [end]
         best = min(found, key=lambda end: end.value)
         ends = tuple((end.value, tuple(end.delta.tolist())) for end in found) if len(found) > 1 else ()
         result = replace(track.result(best.stop), ends=ends)
@@ -78,11 +89,22 @@ class _End:
     hessian: torch.Tensor  # (n, n) there
 
 
-def _descend(track: BestSoFar, objective: SmoothObjective, start: torch.Tensor, settings: LevenbergMarquardt) -> _End:
-    """Where a descent from one start leads."""
+def _descend(
+    track: BestSoFar,
+    objective: SmoothObjective,
+    start: torch.Tensor,
+    settings: LevenbergMarquardt,
+    earlier: Sequence[_End],
+) -> _End | None:
+    """Where a descent from one start leads; None if that is where an earlier one ended."""
     here, model = start, _quadratic(track, objective, start)
     damping, growth = _DAMPING, 2.0
+    values = [model.value]  # the best after each evaluation
     for _ in range(settings.max_iterations):
+        if any(model.value >= end.value and float((here - end.delta).norm()) < _SAME for end in earlier):
+            return None
+        if len(values) > _PATIENCE and values[-1 - _PATIENCE] - values[-1] < _STALLED * settings.tol_f:
+            return _End(Stop.FLAT, model.value, here, model.hessian)
         diagonal = model.hessian.diagonal()
         # Marquardt's scaling: a stiff degree of freedom does not hold back a soft one, such as a small object's.
         unit = diagonal.clamp(min=_SOFTEST * float(diagonal.mean()) + 1e-12)
@@ -103,6 +125,7 @@ def _descend(track: BestSoFar, objective: SmoothObjective, start: torch.Tensor, 
             damping, growth = damping * growth, growth * 2
             if damping > _MOST_DAMPING:
                 return _End(Stop.ROUNDOFF, model.value, here, model.hessian)
+        values.append(model.value)
     return _End(Stop.BUDGET, model.value, here, model.hessian)
 
 

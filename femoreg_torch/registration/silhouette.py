@@ -18,7 +18,7 @@ from femoreg_torch.geometry import Camera, about_point, exp_se3, twist_rates
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective
 from femoreg_torch.registration.scene import Outline, Segmentation
 from femoreg_torch.registration.weights import dilated
-from femoreg_torch.volume import BoneLabels, resample_isotropic
+from femoreg_torch.volume import BoneLabels, looked_up, resample_isotropic
 
 _SPACING_MM = 2.5  # of the mask and of the steps through it
 _OPAQUE_MM = 2.0  # path in bone after which a pixel is labelled with probability 1 − 1/e; labels begin at 1.5 mm
@@ -51,7 +51,7 @@ def outline_of(bones: BoneLabels, anatomy: Anatomy | None) -> Outline | None:
         return None
     wanted = np.zeros(256, np.float32)
     wanted[list(bones.of(told, anatomy))] = 1
-    inside = torch.from_numpy(wanted[bones.labels.data.numpy()])
+    inside = torch.from_numpy(looked_up(wanted, bones.labels.data.numpy()))
     return Outline(resample_isotropic(bones.labels.with_data(inside), _SPACING_MM), told)
 
 

@@ -207,6 +207,22 @@ def grad_ncc_gradient(  # type: ignore[no-untyped-def]
     return out
 
 
+@_parallel
+def grad_ncc_and_gradient(image, fixed, mean, scale, weights, radius, floor, average, slope):  # type: ignore[no-untyped-def]
+    """Mean over both derivative maps of Σ weight · NCC of one image (H, W), and its gradient (H, W)."""
+    height, width = image.shape
+    side = 2 * radius + 1
+    values, out = np.empty(2), np.zeros((height, width), np.float32)
+    maps, back = np.empty((2, height, width), np.float32), np.empty((2, height, width), np.float32)
+    _gradients(image, average, slope, maps)
+    for d in nb.prange(2):
+        store = np.empty((3, height - side + 1, width - side + 1))
+        values[d] = _correlate(maps[d], fixed[d], mean[d], scale[d], weights, radius, floor, True, store)
+        _spread_back(store, maps[d], fixed[d], radius, 0.5, back[d])
+    _add_transposed_gradients(back, average, slope, out)
+    return (values[0] + values[1]) / 2, out
+
+
 # Curvature ------------------------------------------------------------------------------------------------------------
 @_jit
 def _box(image):  # type: ignore[no-untyped-def]

@@ -85,12 +85,21 @@ class FixedGradNcc:
 
     def quadratic(self, image: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost (), scores (T, n), Gauss–Newton hessian (n, n), see `SmoothFixedSimilarity`; the gradient is exact."""
-        moving = image[None].clone().requires_grad_()
-        cost = self(moving)[0]
-        (slope,) = torch.autograd.grad(cost, moving)
+        cost, slope = self._with_slope(image)
         changes = jacobian.movedim(-1, 0)  # (n, H, W)
         scores = tile_scores(changes, slope, _TILE * (2 * self.radius + 1))
-        return cost.detach(), scores, self.curvature(image, changes, _STRIDE)
+        return cost, scores, self.curvature(image, changes, _STRIDE)
+
+    def _with_slope(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Cost () of an image (H, W), and its derivative (1, H, W) by the image."""
+        if image.device.type == "cpu" and image.dtype == torch.float32:
+            check_size(image[None], self.fixed)
+            value, slope = cpu.grad_ncc_and_gradient(image.contiguous().numpy(), *_CpuGradNcc._arguments(self))
+            return torch.tensor(1 - value, dtype=torch.float64), -torch.from_numpy(slope)[None]
+        moving = image[None].clone().requires_grad_()
+        cost = self(moving)[0]
+        (derivative,) = torch.autograd.grad(cost, moving)
+        return cost.detach(), derivative
 
     def curvature(self, image: Tensor, changes: Tensor, stride: int) -> Tensor:
         """Gauss–Newton hessian (n, n) float64 about an image (H, W) with changes (n, H, W); every stride-th patch."""

@@ -4,7 +4,7 @@ from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenu
 from femoreg_torch.volume.bones import BoneLabels, bone_labels
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
 from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
-from femoreg_torch.volume.labels import label_box_centre
+from femoreg_torch.volume.labels import label_box_centre, looked_up
 from femoreg_torch.volume.landmarks import check_inside, read_landmarks, read_path_points, write_landmarks
 from femoreg_torch.volume.mesh import check_closed, voxelise_mesh
 from femoreg_torch.volume.mesh_files import bounds_of, is_in_ras, read_bodies, read_mesh
@@ -41,6 +41,7 @@ __all__ = [
     "label_box_centre",
     "label_share",
     "labelled_device",
+    "looked_up",
     "read_bodies",
     "read_ct",
     "read_ct_told",

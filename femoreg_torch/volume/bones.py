@@ -15,7 +15,7 @@ from femoreg_torch.anatomy import Anatomy, LabelTable
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import transform_points
 from femoreg_torch.volume.grid import Volume
-from femoreg_torch.volume.labels import label_box
+from femoreg_torch.volume.labels import label_box, looked_up
 
 _OTHER_BONE_HU = 80.0  # mean above which a label that no table names is bone, and a bone's rim does not grow into it
 _NEAR_VOXELS = 15  # a landmark lies closer than this to its bone
@@ -80,12 +80,13 @@ def bone_labels(
     for name in reversed(names):  # of two that share an id the first takes it; they are parted below
         lookup[list(table[name])] = number[name]
     lookup[_other_bones(data, counts, ct, table)] = max(number.values()) + 1
-    found = torch.from_numpy(lookup[data])
+    found = torch.from_numpy(looked_up(lookup, data))
+    present = set(lookup[np.flatnonzero(counts)].tolist())
     for name in names:
         mirror = anatomy.bone(name).mirror if anatomy and name in order else name
         if mirror in number and number[mirror] > number[name] and set(table[name]) & set(table[mirror]):
             _part_sides(labels.with_data(found), name, mirror, number, anatomy, landmarks)
-    present = set(torch.bincount(found.flatten()).nonzero()[:, 0].tolist())
+            present = set(torch.bincount(found.flatten()).nonzero()[:, 0].tolist())
     return BoneLabels(
         labels.with_data(found),
         {name: n for name, n in number.items() if n in present},

@@ -1,9 +1,13 @@
 """Where the structures of a label map are."""
 
 from collections.abc import Sequence
+from typing import Any
 from weakref import WeakKeyDictionary
 
+import cv2
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
@@ -15,6 +19,18 @@ Corner = tuple[int, int, int]  # x, y, z
 _Boxes = list[tuple[slice, slice, slice] | None]
 # Of the labels of a map, and the version of the data that they were found in.
 _boxes: WeakKeyDictionary[Volume, tuple[int, _Boxes]] = WeakKeyDictionary()
+
+
+def looked_up(table: NDArray[Any], labels: NDArray[Any]) -> NDArray[Any]:
+    """The entries of a table (n,) that labels (Z, Y, X) of whole numbers below n stand for.
+
+    OpenCV looks bytes up ten times as fast as NumPy.
+    """
+    if labels.dtype != np.uint8:
+        return table[labels]
+    whole = np.zeros(256, table.dtype)
+    whole[: len(table)] = table[:256]
+    return np.asarray(cv2.LUT(np.ascontiguousarray(labels).reshape(len(labels), -1), whole)).reshape(labels.shape)
 
 
 def label_box(labels: Volume, ids: Sequence[int]) -> tuple[Corner, Corner]:

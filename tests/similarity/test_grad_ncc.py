@@ -80,6 +80,19 @@ def test_compiled_and_plain_torch_agree_in_value_and_gradient() -> None:
     torch.testing.assert_close(fast.grad[:2].double(), slow.grad[:2], atol=1e-6, rtol=1e-3)
 
 
+def test_the_quadratic_has_value_and_gradient_of_plain_torch() -> None:
+    fixed = GradNcc(3).against(picture(0))
+    image = picture(1)
+    jacobian = torch.stack([picture(2), picture(3)], -1)
+    cost, scores, _ = fixed.quadratic(image, jacobian)
+    moving = image.double()[None].requires_grad_()
+    plain = 1 - fixed._reference(moving)[0]
+    (slope,) = torch.autograd.grad(plain, moving)
+    assert float(cost) == pytest.approx(plain.item(), abs=1e-6)
+    expected = (jacobian.double() * slope[0, :, :, None]).sum((0, 1))
+    torch.testing.assert_close(scores.sum(0), expected, atol=2e-6, rtol=1e-4)
+
+
 def test_gradient_equals_finite_differences() -> None:
     similarity = GradNcc(2).against(picture(9, 17, 15))
     image = picture(10, 17, 15)[None].double().requires_grad_()

@@ -1,11 +1,21 @@
 """Attenuation of water, and which voxels of a bone are rendered."""
 
+import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.volume import Volume, axis_aligned, hu_to_attenuation, label_box_centre, structure_attenuation
+from femoreg_torch.volume import (
+    Volume,
+    axis_aligned,
+    hu_to_attenuation,
+    label_box_centre,
+    looked_up,
+    structure_attenuation,
+)
+from femoreg_torch.volume.attenuation import _dilated
 
 BONE, OTHER = 5, 1
 
@@ -42,6 +52,23 @@ def test_the_rim_is_kept_but_no_other_bone() -> None:
     assert grown.data[18 - z0, 22 - y0, 28 - x0] > 0  # radius 8, next to the other bone
     assert (grown.data[:, :, 29 - x0 :] == 0).all()
     assert (bare.data > 0).sum() == (labels.data == BONE).sum()
+
+
+def test_a_mask_grows_as_scipy_grows_it() -> None:
+    random = np.random.default_rng(0)
+    mask, allowed = random.random((9, 12, 7)) < 0.05, random.random((9, 12, 7)) < 0.6
+    allowed |= mask
+    for times in (1, 2, 3):
+        expected = ndimage.binary_dilation(mask, iterations=times, mask=allowed)
+        np.testing.assert_array_equal(_dilated(mask, allowed, times), expected)
+
+
+@pytest.mark.parametrize(("kind", "entries"), [(np.uint8, 5), (np.uint8, 400), (np.int32, 400)])
+def test_labels_are_looked_up_in_a_table_of_any_length(kind: type, entries: int) -> None:
+    labels = np.random.default_rng(0).integers(0, min(entries, 256), (3, 4, 5)).astype(kind)
+    for table in (np.arange(entries, dtype=np.float32) / 2, (np.arange(entries) % 7).astype(np.uint8)):
+        np.testing.assert_array_equal(looked_up(table, labels), table[labels])
+        np.testing.assert_array_equal(looked_up(table, labels[:, ::2]), table[labels[:, ::2]])
 
 
 def test_the_crop_keeps_its_place_in_space() -> None:
