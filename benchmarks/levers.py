@@ -7,7 +7,6 @@ together, of the fastest turn; `apart` is the largest difference of the two resu
 """
 
 import argparse
-import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -272,24 +271,17 @@ def _of_the_descents(scene: Scene, poses: Poses) -> Iterator[Lever]:
     def found() -> Tensor:
         return run_stage(scene, off, stage, (1,), seed=0).poses.camera_from_camera1[1]
 
-    def with_constant(name: str, value: float) -> Tensor:
-        kept = getattr(levenberg, name)
-        setattr(levenberg, name, value)
+    def to_the_end() -> Tensor:
+        kept, levenberg._SAME = levenberg._SAME, 0.0
         try:
             return found()
         finally:
-            setattr(levenberg, name, kept)
+            levenberg._SAME = kept
 
     yield Lever(
         "a descent that comes where another ended is given up",
         "coarse C-arm of a view",
-        lambda: with_constant("_SAME", 0.0),
-        found,
-    )
-    yield Lever(
-        "a descent ends where three evaluations gain nothing",
-        "coarse C-arm of a view",
-        lambda: with_constant("_STALLED", -math.inf),
+        to_the_end,
         found,
     )
 

@@ -15,10 +15,8 @@ _LEAST_DAMPING = 1e-7
 _MOST_DAMPING = 1e4
 _SOFT = 5  # directions that are looked along for the bottom of a valley
 _FLAT = 1e-9  # second difference of values that is none
-_SAME = (
-    0.25  # units of the scales: a descent that comes so near to where an earlier one ended, and lies higher, joins it
-)
-_PATIENCE, _STALLED = 3, 10.0  # a descent ends when so many evaluations together gained less than so many `tol_f`
+# Units of the scales: a descent that comes so near to where an earlier one ended, and lies higher, would end there.
+_SAME = 0.25
 
 
 @dataclass(frozen=True)
@@ -29,8 +27,6 @@ class LevenbergMarquardt:
     With `candidates`, so many random deltas of deviation one are looked at first, and the best `starts` of them and
     zero are refined; the search ends with the best of these. One that comes where an earlier one ended, and fits no
     better, is given up: it would end there too.
-    A descent also ends where three evaluations together gain less than ten `tol_f`: an objective that is drawn from
-    voxels ripples, and its ripples promise steps that they do not keep.
 
     An objective that is drawn from voxels ripples. Where it is soft, ripples hold a descent up well before the minimum
     of what lies beneath. With `valley` the search goes on: along each of the five directions of least curvature, to the
@@ -99,12 +95,9 @@ def _descend(
     """Where a descent from one start leads; None if that is where an earlier one ended."""
     here, model = start, _quadratic(track, objective, start)
     damping, growth = _DAMPING, 2.0
-    values = [model.value]  # the best after each evaluation
     for _ in range(settings.max_iterations):
         if any(model.value >= end.value and float((here - end.delta).norm()) < _SAME for end in earlier):
             return None
-        if len(values) > _PATIENCE and values[-1 - _PATIENCE] - values[-1] < _STALLED * settings.tol_f:
-            return _End(Stop.FLAT, model.value, here, model.hessian)
         diagonal = model.hessian.diagonal()
         # Marquardt's scaling: a stiff degree of freedom does not hold back a soft one, such as a small object's.
         unit = diagonal.clamp(min=_SOFTEST * float(diagonal.mean()) + 1e-12)
@@ -125,7 +118,6 @@ def _descend(
             damping, growth = damping * growth, growth * 2
             if damping > _MOST_DAMPING:
                 return _End(Stop.ROUNDOFF, model.value, here, model.hessian)
-        values.append(model.value)
     return _End(Stop.BUDGET, model.value, here, model.hessian)
 
 
