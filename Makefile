@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test fuzz audit lint notebooks bench bench-gpu accuracy capture-range trust ablation plans
+.PHONY: setup demo test fuzz soak audit lint notebooks bench bench-gpu accuracy capture-range trust ablation plans
 
 setup: .venv/.installed
 
@@ -23,10 +23,14 @@ test: setup
 fuzz: setup
 	FEMOREG_FUZZ_COUNT=10000 $(BIN)/python -m pytest tests/fuzz
 
-# known vulnerabilities of what constraints.txt pins; needs a network
+# two hundred registrations of a small case in one process: equal results, memory flat; FEMOREG_SOAK_COUNT says how many
+soak: setup
+	$(BIN)/python -m pytest -m soak -s tests/evaluation/test_soak.py
+
+# known vulnerabilities of what constraints.txt pins; needs a network, and fails where a package could not be looked up
 audit: setup
 	$(BIN)/python -m pip install --quiet pip-audit
-	$(BIN)/python -m pip_audit --requirement constraints.txt --no-deps --disable-pip
+	$(BIN)/python -m pip_audit --strict --requirement constraints.txt --no-deps --disable-pip
 
 lint: setup
 	$(BIN)/ruff check .

@@ -233,5 +233,6 @@ def read_csv(path: Path, columns: Collection[str]) -> list[dict[str, str]]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
     if not rows or not set(columns) <= set(rows[0]):
-        raise InputError(f"{path}: a header with {', '.join(columns)}, and rows below it, were expected.")
+        header = f"a header with {', '.join(columns)}" if columns else "a header"
+        raise InputError(f"{path}: {header}, and rows below it, were expected.")
     return rows

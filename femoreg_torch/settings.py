@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import re
 from collections.abc import Iterator, Mapping
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -29,9 +30,16 @@ def _argument(text: str) -> Any:
     return yaml_content(text, "value")
 
 
+_CLASS = re.compile(r"<class '(?:\w+\.)*(\w+)'>")
+_UNION = re.compile(
+    r"Does not validate against any of the Union subtypes Subtypes: \[(.*?)\] Errors: .*?(?= Given value|$)"
+)
+
+
 def told(error: Exception) -> str:
     """What jsonargparse says of a value, on one line, the middle of what is long left out."""
-    text = " ".join(str(error).split())
+    text = _CLASS.sub(r"\1", " ".join(str(error).split()))
+    text = _UNION.sub(lambda found: f"{found[1].replace(', NoneType', '')} was expected.", text)
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 2 :]}"
 
 

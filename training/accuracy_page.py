@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from femoreg_torch.anatomy import HIP
+from femoreg_torch.errors import InputError
 from femoreg_torch.files import write_json, write_text
 from training.accuracy import COARSE, FAIR, GROSS_MM, NEAR_MM, REGISTERED_DEG, Accuracy, Measure, summarise
 from training.calibration import RIGHT_MM, calibration_error, draw_reliability
@@ -34,10 +35,13 @@ _ROWS = {  # figure → what it is called, and its unit
 def write_accuracy(out: Path, readings: Sequence[Reading], altered: Mapping[str, Outcomes]) -> str:
     """Write `accuracy.json`, `accuracy.md` and `reliability.png` into the folder `out`; returns the page.
 
-    `altered` says what became of start poses in altered images; empty where that was not measured.
+    `altered` says what became of start poses in altered images; empty where that was not measured. Raises `InputError`
+    where no image was read.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    if not readings:
+        raise InputError("there is no image in these files to measure anything on.")
     accuracy = summarise(readings)
+    out.mkdir(parents=True, exist_ok=True)
     error = calibration_error(readings)
     outcomes = {name: asdict(counted) for name, counted in altered.items()}
     write_json(out / "accuracy.json", {**asdict(accuracy), "calibration_error": error, "altered": outcomes})

@@ -9,6 +9,8 @@ from torch import nn
 
 from femoreg_torch.errors import InputError
 
+_STATE = ("epoch", "loops", "optimizer_states", "lr_schedulers")  # what Lightning goes on from, beside the weights
+
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """The content of a checkpoint, plain values alone. Raises `InputError` if it is cut off or another file."""
@@ -35,6 +37,9 @@ def last_good_checkpoint(folder: Path, module: nn.Module, report: Callable[[str]
             report(f"passed over: {error}")
             continue
         _check_fits(content["state_dict"], module, path)
+        if missing := [name for name in _STATE if name not in content]:
+            report(f"passed over: {path}: holds weights, but not the state of a run ({missing[0]} is missing).")
+            continue
         return path
     raise InputError(
         f"{folder}: holds no whole checkpoint, so there is nothing to resume. Train anew into another folder."

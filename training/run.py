@@ -1,6 +1,7 @@
 """One training run from settings to exported weights."""
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,7 @@ from training.pictures import Pictures
 from training.settings import TrainingSettings
 
 _MONITORED = "validation/loss"
+_CSV, _TENSORBOARD = "csv", "tensorboard"  # folders of logs
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def train_network(
     last = out / "checkpoints" / "last.ckpt"
     if resume and not any(last.parent.glob("*.ckpt")):
         raise InputError(f"{last}: no such file, so there is nothing to resume. Leave out --resume.")
-    if last.is_file() and not resume:
+    if not resume and any(last.parent.glob("*.ckpt")):
         raise InputError(f"{out}: holds a training run. Continue it with --resume, or choose another folder.")
     _check_machine(machine)
     run = settings.run
@@ -76,11 +78,15 @@ def train_network(
     if resume:
         like = NetworkTraining(settings.network, settings.loss, run.optimisation)
         resumed = last_good_checkpoint(last.parent, like, console.print)
+    elif start is not None:
+        begin_with(start, settings.network.build())  # complains before anything is rendered
     torch.set_num_threads(run.threads)
     cohort = render_cohort(run.cohort, cases, cache, console.print)
+    for name in () if resume else (_CSV, _TENSORBOARD):  # of a run that was killed before its first checkpoint
+        shutil.rmtree(out / name, ignore_errors=True)
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "settings.json", {**settings.as_content(), "cases": [case.resolve().name for case in cases]})
-    seed_everything(run.seed)
+    seed_everything(run.seed, verbose=False)
     optimisation = run.optimisation
     data = ViewData(
         cohort,
@@ -113,7 +119,7 @@ def train_network(
         max_epochs=optimisation.epochs,
         reload_dataloaders_every_n_epochs=1,
         use_distributed_sampler=False,
-        logger=[CSVLogger(out, "csv"), TensorBoardLogger(out, "tensorboard", version="")],
+        logger=[CSVLogger(out, _CSV), TensorBoardLogger(out, _TENSORBOARD, version="")],
         callbacks=callbacks,
         enable_model_summary=False,
         log_every_n_steps=min(25, optimisation.batches_per_epoch),
@@ -122,7 +128,7 @@ def train_network(
     trainer.fit(module, data, ckpt_path=resumed)
     if not trainer.is_global_zero:  # one process writes
         return out / SHIPPED_WEIGHTS
-    draw_curves(out / "tensorboard", out / "curves.png")
+    draw_curves(out / _TENSORBOARD, out / "curves.png")
     return export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
 
 

@@ -113,8 +113,11 @@ def nifti_warnings(path: Path) -> list[str]:
         return []
     size = np.array([*header.get_data_shape()[:3], 2]) - 1
     corners = np.array([[size[k] * (n >> k & 1) for k in range(3)] + [1] for n in range(8)])
-    apart = float(np.linalg.norm((corners @ (header.get_sform() - header.get_qform()).T), axis=1).max())
-    if apart > _DISAGREE_MM:
+    try:
+        apart = float(np.linalg.norm((corners @ (header.get_sform() - header.get_qform()).T), axis=1).max())
+    except ValueError:  # a quaternion that is none
+        return ["the qform of the NIfTI header is damaged, its sform was taken; other programs may take the first"]
+    if not apart < np.inf or apart > _DISAGREE_MM:
         return [
             f"sform and qform of the NIfTI header disagree by up to {apart:.1f} mm; programs differ in which they take"
         ]

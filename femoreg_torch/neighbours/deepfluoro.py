@@ -23,12 +23,14 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Camera
 from femoreg_torch.neighbours.frames import XregCamera
-from femoreg_torch.neighbours.xreg import entry, matrix, open_hdf5, scalar
+from femoreg_torch.neighbours.hdf5 import matrix, names_in, numbers, open_hdf5, scalar, shape_of, text, there, whole
+from femoreg_torch.neighbours.xreg import camera_shape
 from femoreg_torch.volume import Volume
 
 BONES = ("hip_left", "hip_right", "vertebrae", "sacrum", "femur_left", "femur_right")  # labels 1 to 6
 _OBJECTS = {"pelvis": "pelvis", "femur_left": "left-femur", "femur_right": "right-femur"}
 _DEGREES = {False: 0, True: 180}
+_MOST_LANDMARKS = 99  # their names have two digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +61,9 @@ class Picture:
 def is_full_resolution(path: Path) -> bool:
     """Which of the two layouts a file has. Raises `InputError` if neither."""
     with open_hdf5(path) as file:
-        if "proj-params" in file:
+        if there(file, "proj-params", path):
             return True
-        if "land-names" in file:
+        if there(file, "land-names", path):
             return False
     raise InputError(f"{path}: neither layout of the DeepFluoro data set: no `proj-params` and no `land-names`.")
 
@@ -69,32 +71,23 @@ def is_full_resolution(path: Path) -> bool:
 def specimens(path: Path) -> list[str]:
     """Names of the specimens of a full-resolution file."""
     with open_hdf5(path) as file:
-        return sorted(name for name in file if name != "proj-params")
+        return [name for name in names_in(file, "/", path) if name != "proj-params"]
 
 
 def read_specimen(path: Path, name: str) -> Specimen:
     """The CT, label map and landmarks of a specimen. Raises `InputError`."""
     with open_hdf5(path) as file:
         landmarks = {
-            str(mark): matrix(file, f"{name}/vol-landmarks/{mark}", (3,), path)
-            for mark in entry_group(file, f"{name}/vol-landmarks", path)
+            mark: matrix(file, f"{name}/vol-landmarks/{mark}", (3,), path)
+            for mark in names_in(file, f"{name}/vol-landmarks", path)
         }
         ct = _volume(file, f"{name}/vol", np.float32, path)
         labels = _volume(file, f"{name}/vol-seg/image", np.uint8, path)
     return Specimen(name, ct, labels, landmarks)
 
 
-def entry_group(file: Any, name: str, path: Path) -> list[str]:
-    """Names of the entries of a group. Raises `InputError` where there is none."""
-    if name not in file:
-        raise InputError(f"{path}: `{name}` is missing.")
-    return list(file[name])
-
-
 def _volume(file: Any, name: str, dtype: Any, path: Path) -> Volume:
-    values = np.asarray(entry(file, f"{name}/pixels", path), dtype=dtype)
-    if values.ndim != 3:
-        raise InputError(f"{path}, {name}/pixels: a volume was expected, found {values.shape}.")
+    values = numbers(file, f"{name}/pixels", 3, path).astype(dtype)
     affine = torch.eye(4, dtype=torch.float64)
     spacing = matrix(file, f"{name}/spacing", (3,), path)
     affine[:3, :3] = matrix(file, f"{name}/dir-mat", (3, 3), path) @ torch.diag(spacing)
@@ -108,33 +101,35 @@ def read_pictures(path: Path, specimen: str) -> Iterator[Picture]:
         carm = XregCamera(
             matrix(file, "proj-params/intrinsic", (3, 3), path),
             matrix(file, "proj-params/extrinsic", (4, 4), path),
-            (int(scalar(file, "proj-params/num-rows", path)), int(scalar(file, "proj-params/num-cols", path))),
+            camera_shape(file, "proj-params/num-rows", "proj-params/num-cols", path),
             (
                 scalar(file, "proj-params/pixel-row-spacing", path),
                 scalar(file, "proj-params/pixel-col-spacing", path),
             ),
         )
-        for name in sorted(entry_group(file, f"{specimen}/projections", path)):
+        for name in names_in(file, f"{specimen}/projections", path):
             yield _picture(file, carm, specimen, name, path)
 
 
 def _picture(file: Any, carm: XregCamera, specimen: str, name: str, path: Path) -> Picture:
     group = f"{specimen}/projections/{name}"
-    pixels = np.asarray(entry(file, f"{group}/image/pixels", path), dtype=np.float32)
+    pixels = numbers(file, f"{group}/image/pixels", 2, path).astype(np.float32)
     if pixels.shape != carm.shape:
         raise InputError(f"{path}, {group}: the image is {pixels.shape}, but `proj-params` say {carm.shape}.")
-    turned = bool(scalar(file, f"{group}/rot-180-for-up", path)) if f"{group}/rot-180-for-up" in file else False
+    turn = f"{group}/rot-180-for-up"
+    turned = there(file, turn, path) and bool(scalar(file, turn, path))
     display = Display("posterior", turned_deg=_DEGREES[turned])
     poses = {}
     for thing, told in _OBJECTS.items():
         key = f"{group}/gt-poses/cam-to-{told}-vol"
         trusted = f"{group}/gt-poses/{told}-good-fov"
-        if key in file and (trusted not in file or scalar(file, trusted, path)):
+        if there(file, key, path) and (not there(file, trusted, path) or scalar(file, trusted, path)):
             poses[thing] = carm.camera_from_lps(matrix(file, key, (4, 4), path), display)
-    labels = f"{group}/gt-seg/pixels"
-    if labels not in file:
-        labels = f"{group}/gt-seg/image/pixels"
-    marks = list(file[f"{group}/gt-landmarks"]) if f"{group}/gt-landmarks" in file else []
+    known = [name for name in (f"{group}/gt-seg/pixels", f"{group}/gt-seg/image/pixels") if there(file, name, path)]
+    labels = numbers(file, known[0], 2, path).astype(np.uint8) if known else None
+    if labels is not None and labels.shape != carm.shape:
+        raise InputError(f"{path}, {known[0]}: labels are {labels.shape}, but the image is {carm.shape}.")
+    marks = names_in(file, f"{group}/gt-landmarks", path) if there(file, f"{group}/gt-landmarks", path) else []
     return Picture(
         specimen,
         name,
@@ -142,8 +137,8 @@ def _picture(file: Any, carm: XregCamera, specimen: str, name: str, path: Path) 
         "raw",
         carm.camera,
         display,
-        torch.from_numpy(np.asarray(file[labels], dtype=np.uint8)) if labels in file else None,
-        {str(mark): matrix(file, f"{group}/gt-landmarks/{mark}", (2,), path) for mark in marks},
+        None if labels is None else torch.from_numpy(labels),
+        {mark: matrix(file, f"{group}/gt-landmarks/{mark}", (2,), path) for mark in marks},
         poses,
     )
 
@@ -154,25 +149,38 @@ def read_preprocessed(path: Path, detector: Camera, border_px: int = 50) -> Iter
     Pixel u of a file that keeps every s-th one is pixel 50 + s u of the detector.
     """
     with open_hdf5(path) as file:
-        count = int(scalar(file, "land-names/num-lands", path))
-        names = [entry(file, f"land-names/land-{n:02d}", path)[()] for n in range(count)]
-        names = [name.decode() if isinstance(name, bytes) else str(name) for name in names]
-        for specimen in sorted(name for name in file if name != "land-names"):
-            projs = entry(file, f"{specimen}/projs", path)
-            rows, columns = projs.shape[1:]
-            step = round((detector.shape[0] - 2 * border_px) / rows)
-            spans = [slice(border_px, border_px + (n - 1) * step + 1, step) for n in (rows, columns)]
-            camera = detector.window(*spans)
-            segs, lands = entry(file, f"{specimen}/segs", path), entry(file, f"{specimen}/lands", path)
-            for n in range(len(projs)):
+        count = whole(file, "land-names/num-lands", 0, _MOST_LANDMARKS, path)
+        names = [text(file, f"land-names/land-{n:02d}", path) for n in range(count)]
+        for specimen in names_in(file, "/", path):
+            if specimen == "land-names":
+                continue
+            projs, segs, lands = (f"{specimen}/{part}" for part in ("projs", "segs", "lands"))
+            images, rows, columns = shape_of(file, projs, 3, path)
+            if shape_of(file, segs, 3, path) != (images, rows, columns):
+                raise InputError(f"{path}, {segs}: the shape of `{projs}`, {(images, rows, columns)}, was expected.")
+            if shape_of(file, lands, 3, path) != (images, 2, count):
+                raise InputError(f"{path}, {lands}: {(images, 2, count)} numbers were expected.")
+            camera = _coarser(detector, rows, columns, border_px, f"{path}, {projs}")
+            for n in range(images):
+                marks = numbers(file, lands, 3, path, at=n, finite=False).astype(np.float64)  # infinite where unseen
                 yield Picture(
                     specimen,
                     f"{n:03d}",
-                    torch.from_numpy(np.asarray(projs[n], dtype=np.float32)),
+                    torch.from_numpy(numbers(file, projs, 3, path, at=n).astype(np.float32)),
                     "log",
                     camera,
                     Display("posterior"),
-                    torch.from_numpy(np.asarray(segs[n], dtype=np.uint8)),
-                    {name: torch.from_numpy(np.asarray(lands[n, :, m], np.float64)) for m, name in enumerate(names)},
+                    torch.from_numpy(numbers(file, segs, 3, path, at=n).astype(np.uint8)),
+                    {name: torch.from_numpy(marks[:, m]) for m, name in enumerate(names)},
                     {},
                 )
+
+
+def _coarser(detector: Camera, rows: int, columns: int, border_px: int, where: str) -> Camera:
+    """The camera of a picture of every s-th pixel of a detector within its border."""
+    within = [n - 2 * border_px for n in detector.shape]
+    step = round(within[0] / rows)
+    spans = [slice(border_px, border_px + (n - 1) * step + 1, step) for n in (rows, columns)] if step else []
+    if not spans or any(span.stop > border_px + inside for span, inside in zip(spans, within, strict=True)):
+        raise InputError(f"{where}: {rows} × {columns} pixels are no coarser grid on {within[0]} × {within[1]} ones.")
+    return detector.window(*spans)

@@ -28,6 +28,7 @@ _RAS_FROM_LPS = torch.diag(torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64))
 _AGAINST = torch.diag(torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64))  # DiffDRR's axes in the stored picture's
 _NEGATIVE_Z = "origin-at-focal-pt-det-neg-z"  # xReg's names for where the detector lies
 _POSITIVE_Z = "origin-at-focal-pt-det-pos-z"
+_FLAT = 0.5  # determinant of a rotation that is none; `check_rigid` is told the exact one
 
 
 def _matrix(*rows: tuple[int, int, int]) -> Tensor:
@@ -159,6 +160,8 @@ class XregCamera:
 
     def camera_from_lps(self, lps_from_world: Tensor, display: Display) -> Tensor:
         """Of a pose "cam-to-vol" (4, 4), from the C-arm's world to the CT. Raises `InputError` if it is mirrored."""
+        if lps_from_world[:3, :3].det().abs() < _FLAT:
+            raise InputError("xReg: a pose of the CT flattens it, so it is not rigid.")
         stored = self.stored_from_camera @ self.extrinsic @ torch.linalg.inv(lps_from_world.double())
         return _pose(display.camera_from_stored @ stored, "xReg", display)
 

@@ -16,15 +16,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
-import numpy as np
 import SimpleITK as sitk
 import torch
 from torch import Tensor
 
+from femoreg_torch.arrays import MOST_PIXELS, check_pixels
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import invert_rigid, read_itk_transform
 from femoreg_torch.neighbours.frames import XregCamera
+from femoreg_torch.neighbours.hdf5 import matrix, names_in, numbers, open_hdf5, scalar, text, there, whole
+
+_MOST_PROJECTIONS = 1000  # names have three digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,16 +42,16 @@ class Projection:
 def read_projections(path: Path) -> list[Projection]:
     """All projections of a file. Raises `InputError` for what is missing or of another shape."""
     with open_hdf5(path) as file:
-        if "num-projs" not in file:
+        if not there(file, "num-projs", path):
             raise InputError(f"{path}: no projection data of xReg, it has no `num-projs`.")
         return list(_projections(file, path))
 
 
 def _projections(file: Any, path: Path) -> Iterator[Projection]:
-    for n in range(int(scalar(file, "num-projs", path))):
+    for n in range(whole(file, "num-projs", 0, _MOST_PROJECTIONS, path)):
         group = f"proj-{n:03d}"
         cam = f"{group}/cam"
-        shape = (int(scalar(file, f"{cam}/num-rows", path)), int(scalar(file, f"{cam}/num-cols", path)))
+        shape = camera_shape(file, f"{cam}/num-rows", f"{cam}/num-cols", path)
         camera = XregCamera(
             matrix(file, f"{cam}/intrinsic", (3, 3), path),
             matrix(file, f"{cam}/extrinsic", (4, 4), path),
@@ -58,58 +60,23 @@ def _projections(file: Any, path: Path) -> Iterator[Projection]:
             text(file, f"{cam}/cam-coord-frame-type", path),
         )
         image = None
-        if f"{group}/img/pixels" in file:
-            pixels = np.asarray(file[f"{group}/img/pixels"], dtype=np.float32)
+        if there(file, f"{group}/img/pixels", path):
+            pixels = numbers(file, f"{group}/img/pixels", 2, path).astype("float32")
             if pixels.shape != shape:
                 raise InputError(f"{path}, {group}: the image is {pixels.shape}, but its camera has {shape} pixels.")
             image = torch.from_numpy(pixels)
-        names = list(file[f"{group}/landmarks"]) if f"{group}/landmarks" in file else []
-        landmarks = {name: matrix(file, f"{group}/landmarks/{name}", (2,), path) for name in names}
-        turn = int(scalar(file, f"{group}/rot-to-pat-up", path)) if f"{group}/rot-to-pat-up" in file else None
-        yield Projection(image, camera, landmarks, turn)
+        marks = f"{group}/landmarks"
+        names = names_in(file, marks, path) if there(file, marks, path) else []
+        landmarks = {name: matrix(file, f"{marks}/{name}", (2,), path) for name in names}
+        turn = f"{group}/rot-to-pat-up"
+        yield Projection(image, camera, landmarks, int(scalar(file, turn, path)) if there(file, turn, path) else None)
 
 
-def open_hdf5(path: Path) -> Any:
-    """An HDF5 file for reading. Raises `InputError` if it is missing or something else."""
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file.")
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read as HDF5; the file is damaged or something else.") from error
-
-
-def entry(file: Any, name: str, path: Path) -> Any:
-    """The data set of a name. Raises `InputError` where there is none."""
-    if name not in file or not isinstance(file[name], h5py.Dataset):
-        raise InputError(f"{path}: `{name}` is missing.")
-    return file[name]
-
-
-def scalar(file: Any, name: str, path: Path) -> float:
-    """A finite number."""
-    values = np.asarray(entry(file, name, path)).ravel()
-    if values.size != 1 or not np.isfinite(values).all():
-        raise InputError(f"{path}, {name}: one number was expected.")
-    return float(values[0])
-
-
-def text(file: Any, name: str, path: Path) -> str:
-    """A text."""
-    value = entry(file, name, path)[()]
-    value = value.ravel()[0] if isinstance(value, np.ndarray) else value
-    return value.decode() if isinstance(value, bytes) else str(value)
-
-
-def matrix(file: Any, name: str, shape: tuple[int, ...], path: Path) -> Tensor:
-    """Finite numbers of a shape, float64; vectors may stand as a column."""
-    values = np.asarray(entry(file, name, path), dtype=np.float64)
-    if len(shape) == 1 and values.size == shape[0]:
-        values = values.ravel()
-    if values.shape != shape or not np.isfinite(values).all():
-        expected = " × ".join(map(str, shape))
-        raise InputError(f"{path}, {name}: {expected} finite numbers were expected, found {values.shape}.")
-    return torch.from_numpy(values)
+def camera_shape(file: Any, rows: str, columns: str, path: Path) -> tuple[int, int]:
+    """Rows and columns of a detector, from these entries. Raises `InputError` for more than any has."""
+    found = (whole(file, rows, 1, MOST_PIXELS, path), whole(file, columns, 1, MOST_PIXELS, path))
+    check_pixels(path, *found)
+    return found
 
 
 def read_transform(path: Path) -> Tensor:

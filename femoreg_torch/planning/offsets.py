@@ -12,14 +12,16 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from femoreg_torch.case.model import Side
-from femoreg_torch.errors import InputError
-from femoreg_torch.files import read_json
+from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.files import read_csv, read_json
 from femoreg_torch.planning.diffusion import diffuse
 from femoreg_torch.planning.path import Ellipsoid, Path, Surroundings
 from femoreg_torch.planning.prepare import Prepared
+from femoreg_torch.text import read_bytes
 
 Array = NDArray[np.float64]
 
+_MOST_BYTES = 2**16  # of a covariance as text
 _AXES = ("lr", "ap", "is")  # of a study's signed columns, as LPS: to the left, to the back, to the head
 
 
@@ -126,20 +128,17 @@ def read_covariance(file: File) -> Array:
     In a result it is `path_covariance`, of mm and degrees. Raises `InputError` for a file that holds neither.
     """
     file = File(file)
-    if not file.is_file():
-        raise InputError(f"{file}: there is no such file. Give the rows of a covariance as text, or a result.json.")
     if file.suffix.lower() == ".json":
         found = read_json(file).get("path_covariance")
         if found is None:
             raise InputError(f"{file}: has no path_covariance. Register a case with a planned path and its tool again.")
         rows: Any = found
     else:
-        rows = [
-            line.replace(",", " ").split() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()
-        ]
+        text = read_bytes(file, _MOST_BYTES).decode("utf-8", "replace")
+        rows = [line.replace(",", " ").split() for line in text.splitlines() if line.strip()]
     try:
         return np.array(rows, float)
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         raise InputError(f"{file}: rows of numbers, all of one length, were expected.") from error
 
 
@@ -163,10 +162,13 @@ def study_moves(folder: File, draws: int, seed: int) -> Array:
         raise InputError(f"{folder}: the runs have no column {missing[0]}. Signed errors along each axis are needed.")
     turns = [f"{name}_deg_{axis}" for name in ("femur", "device") for axis in _AXES]
     columns += turns if all(name in table for name in turns) else []
-    values = np.array([table[name] for name in columns], float).T
+    try:
+        values = np.array([table[name] for name in columns], float).T
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{folder}: numbers were expected in the columns of errors ({shortened(error)}).") from error
     kept = np.isfinite(values).all(1)
     if "trusted" in table:
-        kept &= np.array([str(value).lower() in ("true", "1") for value in table["trusted"]])
+        kept &= np.array([str(value).lower() in ("true", "1") for value in table["trusted"]], bool)
     if not kept.any():
         raise InputError(f"{folder}: no trusted run with errors of {pair[0]} and {pair[1]}.")
     values = values[kept]
@@ -182,12 +184,12 @@ def _read_runs(folder: File) -> dict[str, Sequence[Any]]:
     if parquet.is_file():
         from pyarrow import parquet as reader
 
-        found: dict[str, Sequence[Any]] = reader.read_table(parquet).to_pydict()
+        try:
+            found: dict[str, Sequence[Any]] = reader.read_table(parquet).to_pydict()
+        except (OSError, ValueError) as error:  # pyarrow's own errors are ValueErrors
+            raise InputError(f"{parquet}: cannot be read as Parquet ({shortened(error)}).") from error
         return found
     if not text.is_file():
         raise InputError(f"{folder}: holds neither runs.parquet nor runs.csv. Give the folder of a study.")
-    import csv
-
-    with text.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    return {name: [row[name] or "nan" for row in rows] for name in (rows[0] if rows else {})}
+    rows = read_csv(text, ())
+    return {name: [row[name] or "nan" for row in rows] for name in rows[0] if name is not None}

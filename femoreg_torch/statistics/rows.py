@@ -10,7 +10,9 @@ is one row for every `round`.
 import re
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+from pandas.api.types import is_scalar
 
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import temporary_file
@@ -37,6 +39,7 @@ ROUNDS = (
 _PARTS = tuple(f"{point}_mm_{axis}" for point in ("entry_point", "tip") for axis in AXES)  # optional
 _OPEN = tuple(BEADS + q.column for q in METRICS)
 NUMBERS = (*_SIGNED, *(q.column for q in METRICS), *_PARTS, *SIGMAS, PELVIS_AT_HEAD, *ROUNDS, *_OPEN)
+_NOT_NEGATIVE = {*(q.column for q in QUANTITIES), *SIGMAS}
 _NOT_TEXT = ("number", "seed", "trusted")
 
 
@@ -60,24 +63,37 @@ def checked_rows(rows: pd.DataFrame, where: str | Path) -> pd.DataFrame:
         raise InputError(f"{where}: has no column {', '.join(missing)}. Is it one row per run of a study?")
     if rows.empty:
         raise InputError(f"{where}: holds no run. Let the study finish at least one.")
-    if not any(quantity.column in rows for quantity in QUANTITIES) and rows["status"].eq(DONE).any():
-        raise InputError(f"{where}: has no error in any column, as {QUANTITIES[0].column} or {QUANTITIES[-1].column}.")
     if unknown := sorted(set(map(str, rows["status"])) - {DONE, REFUSED, FAILED}):
         raise InputError(
             f"{where}: status {shortened(unknown[0])} is unknown; there are {DONE}, {REFUSED} and {FAILED}."
         )
+    if not any(quantity.column in rows for quantity in QUANTITIES) and rows["status"].eq(DONE).any():
+        raise InputError(f"{where}: has no error in any column, as {QUANTITIES[0].column} or {QUANTITIES[-1].column}.")
+    numbers = pd.to_numeric(rows["number"].where(rows["number"].map(is_scalar)), errors="coerce")
+    if not (numbers % 1 == 0).all():
+        raise InputError(f"{where}, column number: whole numbers were expected, one for each procedure.")
     rows = rows.copy()
+    for column in rows.select_dtypes(object):
+        rows[column] = rows[column].map(lambda value: value if is_scalar(value) else _text(value))
     for column in [c for c in (*IDENTITY, *OUTCOME, ASKED) if c in rows and c not in _NOT_TEXT]:
         rows[column] = rows[column].astype(object).where(rows[column].notna(), "").map(_text)
     for column in [c for c in rows if c == "trusted" or c in {f"{name}_trusted" for name in OBJECTS}]:
-        rows[column] = rows[column].eq(True).fillna(False).astype(bool)  # what is not known to be trusted is not
+        rows[column] = rows[column].map(_is_true).astype(bool)  # what is not known to be trusted is not
     rows["trusted"] &= rows["status"].eq(DONE)
     for column in [c for c in rows if c in NUMBERS or c.startswith((SECONDS, EVALUATIONS))]:
         try:
             rows[column] = pd.to_numeric(rows[column]).astype(float)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{where}, column {column}: numbers were expected ({error}).") from error
+            raise InputError(f"{where}, column {column}: numbers were expected ({shortened(error)}).") from error
+        if np.isinf(rows[column]).any():
+            raise InputError(f"{where}, column {column}: holds an infinite number.")
+        if column in _NOT_NEGATIVE and (rows[column] < 0).any():
+            raise InputError(f"{where}, column {column}: an error or a deviation cannot be below 0.")
     return rows.sort_values(["condition", "number"], kind="stable", ignore_index=True)
+
+
+def _is_true(value: object) -> bool:
+    return bool(is_scalar(value) and not pd.isna(value) and value == True)  # noqa: E712  # 1 and 1.0 too, as CSV and Parquet may hold it
 
 
 def _text(value: object) -> str:

@@ -20,6 +20,7 @@ from femoreg_torch.errors import InputError
 _TAGS = (
     "SOPInstanceUID", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "ImageType", "Rows",
     "Columns", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "NumberOfFrames", "AcquisitionNumber",
+    "RescaleSlope", "RescaleIntercept",
 )  # fmt: skip
 _VOLUMES = ("CT", "MR", "PT", "NM", "OT")  # modalities whose series may be volumes; others are images, reports, masks
 _AIR_HU = -1024.0  # what lies outside the slices of a tilted gantry
@@ -43,6 +44,14 @@ class Slice:
         except (TypeError, ValueError):
             return None
         return numbers if numbers.shape == (count,) and np.isfinite(numbers).all() else None
+
+    def number(self, name: str) -> float | None:
+        """The finite number of a tag, or None where it is missing or holds something else."""
+        try:
+            value = float(self.header.get(name))
+        except (TypeError, ValueError):
+            return None
+        return value if np.isfinite(value) else None
 
     def whole(self, name: str, otherwise: int) -> int:
         """The whole number of a tag."""
@@ -263,6 +272,13 @@ def _check_alike(series: Series, cosines: NDArray[np.float64], pixel: NDArray[np
             raise InputError(
                 f"{where}: {one.path.name} has another orientation or pixel spacing than {series.slices[0].path.name}. "
                 "Export one reconstruction."
+            )
+    for name in ("RescaleSlope", "RescaleIntercept"):
+        lacking = [one.path.name for one in series.slices if one.number(name) is None]
+        if 0 < len(lacking) < len(series.slices):
+            raise InputError(
+                f"{where}: {len(lacking)} of {len(series.slices)} slices have no {name} ({lacking[0]}, …), so their "
+                "values are not in HU. Export the series anew."
             )
 
 

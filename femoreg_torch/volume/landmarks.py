@@ -128,10 +128,10 @@ def _points(path: Path) -> list[tuple[str, Tensor]]:
         content = read_json(path, with_nan=True)  # of a point that was not placed, or a measurement without a value
         points = (_slicer_points if "markups" in content else _plain_points)(content, path)
     found = []
-    for space, label, value in points:
+    for number, (space, label, value) in enumerate(points, 1):
         name = label if isinstance(label, str) else ""
         signs = torch.tensor(_signs(space, f"{path}, coordinate system"), dtype=torch.float64)
-        found.append((name, _point(value, f"{path}, {name}") * signs))
+        found.append((name, _point(value, f"{path}, {name or f'point {number} (no name)'}") * signs))
     return found
 
 

@@ -14,6 +14,7 @@ from femoreg_torch.errors import InputError
 if TYPE_CHECKING:
     import nibabel
 
+_SAME_SIZE = 0.01  # voxels, of what rounding may make of them
 _SUFFIXES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz")
 
 
@@ -33,6 +34,7 @@ def check_nifti(path: Path) -> None:
             there = None if path.name.lower().endswith((".hdr", ".img", ".img.gz")) else path.stat().st_size
             if not np.isfinite(image.affine).all():
                 raise InputError(f"{path}: its origin or its axes are not finite. Export it anew.")
+            _check_sizes(path, image)
             check_claim(path, image.shape, kind.itemsize, there)
             # Integers are all finite. To decompress them only to see that none is missing would double the time to
             # read.
@@ -46,6 +48,16 @@ def check_nifti(path: Path) -> None:
         raise InputError(f"{path}: cannot be read as NIfTI ({reason}). Export or download it anew.") from error
     if values.dtype.kind in "fc" and not np.isfinite(values).all():
         raise InputError(f"{path}: holds values that are not finite (NaN or infinite). Repair or export it anew.")
+
+
+def _check_sizes(path: Path, image: Any) -> None:
+    """Raises `InputError` where voxels have another size by `pixdim` than by the axes; programs differ in choice."""
+    sized = [n for n, count in enumerate(image.shape[:3]) if count > 1]
+    told = np.abs(np.array(image.header.get_zooms(), float)[sized])
+    axes = np.linalg.norm(image.affine[:3, :3], axis=0)[sized]
+    if not np.allclose(told, axes, rtol=_SAME_SIZE):
+        by = " and ".join(" × ".join(f"{mm:.4g}" for mm in sizes) for sizes in (told, axes))
+        raise InputError(f"{path}: its header tells voxels of {by} mm, by pixdim and by its axes. Export it anew.")
 
 
 def _whole(path: Path, data: "nibabel.arrayproxy.ArrayProxy") -> bool:

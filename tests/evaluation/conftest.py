@@ -1,5 +1,6 @@
 """A small procedure, and a run of it whose poses are the truth."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -104,3 +105,30 @@ def make_procedure(tmp_path: Path) -> tuple[Path, Path]:
     )
     write_json(run / "result.json", result_content(result))
     return folder, run
+
+
+_LEVEL = {"pixel_mm": 16, "step_mm": 8}
+_SIMILARITY = {"kind": "grad_ncc", "patch_radius": 3}
+_SEEN = {"kinds": ["all"], "render": ["all"], "level": _LEVEL, "similarity": _SIMILARITY}
+_OPTIMISER = {
+    "kind": "levenberg_marquardt", "candidates": 20, "starts": 2, "max_iterations": 3, "tol_x": 0.01, "tol_f": 0.000003
+}  # fmt: skip
+_BODIES = [{"move": ["each"], "rotation_deg": [5, 5, 5], "translation_mm": [6, 6, 30]}]
+_STEPS = [
+    {"name": "all", "kind": "stage", "images": "first", "bodies": _BODIES, "optimiser": _OPTIMISER, **_SEEN},
+    {"name": "orbit search", "kind": "orbit_search", "half_range_deg": 10, "step_deg": 5, **_SEEN},
+]
+
+
+@pytest.fixture
+def small_registration(procedure: tuple[Path, Path], tmp_path: Path) -> list[str]:
+    """The command line, but for `--out`, of a registration of the procedure that takes a moment."""
+    case, run = procedure
+    (tmp_path / "small.yaml").write_text(json.dumps({"steps": _STEPS}))
+    told = json.loads((run / "result.json").read_text())
+    poses = {"camera1_from_pelvis": told["camera_from_pelvis"][0]}
+    poses |= {name: told[name] for name in ("camera1_from_femur", "camera1_from_device")}
+    (tmp_path / "start.json").write_text(json.dumps(poses))
+    return [
+        "register", str(case), "--preset", str(tmp_path / "small.yaml"), "--start", str(tmp_path / "start.json")
+    ]  # fmt: skip

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 import pydicom
 import SimpleITK as sitk
@@ -25,8 +26,16 @@ from femoreg_torch.case import read_case, read_result
 from femoreg_torch.case.start_files import read_pixels, read_start_poses
 from femoreg_torch.detect import load_network
 from femoreg_torch.fluoro import read_image
-from femoreg_torch.geometry import load_carm
+from femoreg_torch.geometry import centred_camera, load_carm
 from femoreg_torch.navigation import read_robot
+from femoreg_torch.neighbours.deepfluoro import (
+    is_full_resolution,
+    read_pictures,
+    read_preprocessed,
+    read_specimen,
+    specimens,
+)
+from femoreg_torch.neighbours.xreg import read_projections
 from femoreg_torch.planning.report import CEMENT_NAME, read_plan
 from femoreg_torch.planning.settings import load_planning
 from femoreg_torch.registration.plan import load_plan
@@ -66,7 +75,7 @@ class Door:
 def doors(folder: Path) -> list[Door]:
     """All doors, their valid files written below `folder`."""
     found: list[Door] = []
-    for make in (_case, _whole, _points, _volumes, _images, _meshes, _presets, _networks, _others):
+    for make in (_case, _whole, _points, _volumes, _images, _meshes, _presets, _networks, _others, _hdf5):
         (folder / make.__name__).mkdir()
         found += make(folder / make.__name__)
     return found
@@ -414,7 +423,52 @@ def _others(folder: Path) -> Iterator[Door]:
     }  # fmt: skip
     sitk.WriteImage(sitk.Image(3, 3, 3, sitk.sitkUInt8), str(folder / CEMENT_NAME))
     yield Door("plan", folder / "plan.json", lambda: read_plan(folder), _text(folder / "plan.json", plan))
-    box = trimesh.creation.box((20.0, 10.0, 60.0))
+    box = trimesh.creation.box((60.0, 50.0, 90.0))
     arrays = {f"{bone}_{part}": getattr(box, part) for bone in BONES for part in ("vertices", "faces")}
     np.savez(folder / "bones.npz", **arrays)
     yield _made("surfaces", folder / "bones.npz", read_surfaces)
+
+
+def _hdf5(folder: Path) -> Iterator[Door]:
+    """Both layouts of the DeepFluoro data set, and xReg's projections, small."""
+    draw = np.random.default_rng(0)
+    intrinsic, pose = np.diag([-500.0, -500.0, 1.0]), np.eye(4)
+    intrinsic[:2, 2] = 60.0
+    pose[2, 3] = -700.0
+    with h5py.File(folder / "full.h5", "w") as file:
+        for name, value in {
+            "extrinsic": np.eye(4), "intrinsic": intrinsic, "num-cols": 120, "num-rows": 120,
+            "pixel-col-spacing": 2.0, "pixel-row-spacing": 2.0,
+        }.items():  # fmt: skip
+            file[f"proj-params/{name}"] = value
+        for name in ("vol", "vol-seg/image"):
+            file[f"a/{name}/dir-mat"], file[f"a/{name}/origin"] = np.eye(3), np.zeros((3, 1))
+            file[f"a/{name}/spacing"] = np.ones((3, 1))
+            file[f"a/{name}/pixels"] = np.ones((4, 5, 6), np.float32)
+        file["a/vol-landmarks/FH-l"] = np.ones((3, 1))
+        one = file.create_group("a/projections/000")
+        one["image/pixels"] = draw.integers(100, 60000, (120, 120)).astype(np.float32)
+        one["gt-landmarks/FH-l"] = np.ones((2, 1))
+        one["gt-poses/cam-to-pelvis-vol"], one["gt-poses/pelvis-good-fov"] = np.linalg.inv(pose), 1
+        one["gt-seg/pixels"], one["rot-180-for-up"] = np.zeros((120, 120), np.uint8), 1
+
+    def all_of(path: Path) -> Any:
+        is_full_resolution(path)
+        return [(read_specimen(path, name), list(read_pictures(path, name))) for name in specimens(path)]
+
+    yield _made("DeepFluoro, full", folder / "full.h5", all_of)
+    with h5py.File(folder / "ds.h5", "w") as file:
+        file["land-names/num-lands"], file["land-names/land-00"] = 1, "FH-l"
+        file["01/projs"] = draw.random((2, 45, 45), np.float32)
+        file["01/segs"], file["01/lands"] = np.zeros((2, 45, 45), np.uint8), np.zeros((2, 2, 1), np.float32)
+    detector = centred_camera(1020.0, (0.4, 0.4), (820, 820))
+    yield _made("DeepFluoro, preprocessed", folder / "ds.h5", lambda path: list(read_preprocessed(path, detector)))
+    with h5py.File(folder / "proj.h5", "w") as file:
+        file["num-projs"] = 1
+        cam = file.create_group("proj-000/cam")
+        cam["intrinsic"], cam["extrinsic"], cam["num-rows"], cam["num-cols"] = intrinsic, np.eye(4), 12, 10
+        cam["row-spacing"], cam["col-spacing"] = 2.0, 2.0
+        cam["cam-coord-frame-type"] = "origin-at-focal-pt-det-neg-z"
+        file["proj-000/img/pixels"] = np.ones((12, 10), np.float32)
+        file["proj-000/landmarks/FH-l"], file["proj-000/rot-to-pat-up"] = np.ones((2, 1)), 180
+    yield _made("xReg projections", folder / "proj.h5", read_projections)

@@ -1,11 +1,14 @@
 """Broken files made of valid ones: bytes changed, values of text replaced, and what is nasty by itself."""
 
 import copy
+import io
 import json
 import random
 from collections.abc import Callable
 from typing import Any
 
+import h5py
+import numpy as np
 import yaml
 
 _PLACE = "PLACE-OF-A-NASTY-VALUE"
@@ -119,6 +122,39 @@ def mutated_text(content: Any, as_json: bool, other: bytes, draw: random.Random)
     text = text.replace(f'"{_PLACE}"', nasty) if as_json else text.replace(_PLACE, nasty)
     made = text.encode("utf-8", "surrogatepass")
     return mutated_bytes(made, other, draw) if draw.random() < 0.15 else made
+
+
+def mutated_hdf5(content: bytes, draw: random.Random) -> bytes:
+    """An HDF5 file with one entry taken away, or another thing in its place; bytes changed at random miss most."""
+    made = io.BytesIO(content)
+    with h5py.File(made, "a") as file:
+        names: list[str] = []
+        file.visit(names.append)
+        name = draw.choice(names)
+        del file[name]
+        draw.choice(_HDF5)(file, name)
+    return made.getvalue()
+
+
+_HDF5: tuple[Callable[[Any, str], Any], ...] = (
+    lambda file, name: None,
+    lambda file, name: file.create_group(name),
+    lambda file, name: file.create_dataset(name, data="a word", dtype=h5py.string_dtype()),
+    lambda file, name: file.create_dataset(name, data=b"\xff\xfe"),
+    lambda file, name: file.create_dataset(name, (3,), dtype=h5py.vlen_dtype(np.float32)),
+    lambda file, name: file.create_dataset(name, data=h5py.Empty("f")),
+    lambda file, name: file.create_dataset(name, (2**40,), "f4", chunks=True),
+    lambda file, name: file.create_dataset(name, (2**13, 2**13, 2**13), "f4", chunks=True),
+    lambda file, name: file.create_dataset(name, (4,), "f4", external=[("/etc/hostname", 0, 16)]),
+    lambda file, name: file.create_dataset(name, (1,), dtype=h5py.ref_dtype),
+    lambda file, name: file.create_dataset(name, data=np.zeros(2, [("a", "i4"), ("b", "f4")])),
+    *(
+        lambda file, name, value=value: file.create_dataset(name, data=value)
+        for value in (0, -1, 0.5, 2**62, 1e30, np.nan, np.zeros(0), np.zeros((4, 4)), np.ones((3, 3, 3)), 1j)
+    ),
+    lambda file, name: file.__setitem__(name, h5py.SoftLink(f"/{name}")),
+    lambda file, name: file.__setitem__(name, h5py.ExternalLink("nowhere.h5", "/x")),
+)
 
 
 def _changed(content: Any, draw: random.Random) -> Any:

@@ -1,15 +1,10 @@
 """A disk that fails at the n-th step, for every n, and one that is full after so many bytes: all old or all new.
 
-The heavy part of each command is replaced, so that what is tested is how it writes. Python tells of each call to the
-system before it is made (audit hooks, PEP 578); there the n-th one that writes fails.
+The heavy part of each command is replaced, so that what is tested is how it writes.
 """
 
-import errno
-import os
-import resource
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +14,7 @@ import pytest
 import torch
 import trimesh
 from fuzz_doors import doors
+from fuzz_faults import FAULT, fault, full_after
 
 import femoreg_torch.evaluation
 import femoreg_torch.evaluation.run
@@ -29,54 +25,6 @@ from femoreg_torch.commands.main import main
 from sim.theatre.images import ViewImages
 from training.run import export_weights
 from training.settings import read_settings
-
-_WRITING = ("os.rename", "os.mkdir", "os.link", "os.chmod", "shutil.copyfile", "shutil.copytree", "tempfile.mkdtemp")
-
-
-class _Fault:
-    """Lets the n-th call that writes below a folder fail; told by the interpreter, so it stays installed for good."""
-
-    def __init__(self) -> None:
-        self.folder, self.left = "", 0
-
-    def __call__(self, event: str, arguments: tuple[Any, ...]) -> None:
-        if self.left <= 0 or not self._writes(event, arguments):
-            return
-        self.left -= 1
-        if self.left == 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(arguments[0]))
-
-    def _writes(self, event: str, arguments: tuple[Any, ...]) -> bool:
-        if event == "open":
-            writes = isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
-        else:
-            writes = event in _WRITING
-        return bool(writes) and str(arguments[0]).startswith(self.folder)
-
-
-FAULT = _Fault()
-sys.addaudithook(FAULT)
-
-
-@contextmanager
-def fault(folder: Path, n: int) -> Iterator[None]:
-    """The n-th call that writes below `folder` fails."""
-    FAULT.folder, FAULT.left = str(folder), n
-    try:
-        yield
-    finally:
-        FAULT.left = 0
-
-
-@contextmanager
-def full_after(size: int) -> Iterator[None]:
-    """No file can be longer than so many bytes, whoever writes it, as on a disk that becomes full there."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 from fuzz_doors import Door, doors
-from fuzz_mutators import mutated_bytes, mutated_text
+from fuzz_mutators import mutated_bytes, mutated_hdf5, mutated_text
 
 from femoreg_torch.errors import InputError
 
@@ -54,6 +54,8 @@ def broken(door: Door, valid: bytes, other: bytes, draw: random.Random) -> bytes
     """One broken file."""
     if door.content is not None and draw.random() < 0.85:
         return mutated_text(door.content, door.as_json, other, draw)
+    if door.path.suffix == ".h5" and draw.random() < 0.7:
+        return mutated_hdf5(valid, draw)
     return mutated_bytes(valid, other, draw)
 
 

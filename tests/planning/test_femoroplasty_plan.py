@@ -260,9 +260,22 @@ def test_commands_end_to_end(folder: File, capsys: pytest.CaptureFixture[str]) -
     found = json.loads((out / "robustness.json").read_text())
     assert found["gain_percent_median"] == pytest.approx(offsets["outcomes"]["medial"][0]["gain_percent"])
     capsys.readouterr()
+    bad = folder / "bad"
+    bad.mkdir()
+    (bad / "sure.csv").write_bytes(b"\xff\xfe1 2 3")
+    hostile = {"words": columns | {"femur_mm_lr": ["a", "b"]}, "empty": {name: [] for name in [*columns, "trusted"]}}
+    for name, content in hostile.items():
+        (bad / name).mkdir()
+        parquet.write_table(table(content), bad / name / "runs.parquet")
+    (bad / "cut").mkdir()
+    (bad / "cut" / "runs.parquet").write_bytes((study / "runs.parquet").read_bytes()[:99])
     for words, told in (
+        (["--study", str(bad / "words")], "numbers were expected"),
+        (["--study", str(bad / "empty")], "no trusted run"),
+        (["--study", str(bad / "cut")], "cannot be read as Parquet"),
+        (["--covariance", str(bad / "sure.csv")], "rows of numbers"),
         ([], "either --study or --covariance"),
-        (["--covariance", str(folder / "no.csv")], "there is no such file"),
+        (["--covariance", str(folder / "no.csv")], "no such file"),
         (["--covariance", str(folder / "sure.csv"), "--mean", "[1, 2]"], "mean: 3 numbers"),
     ):
         assert main(["plan-robustness", str(out), *words]) == 2

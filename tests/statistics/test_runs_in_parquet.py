@@ -67,6 +67,37 @@ def test_what_is_not_known_to_be_trusted_is_not() -> None:
     assert found["femur_trusted"].tolist() == [True, False, True, False]
 
 
+@pytest.mark.parametrize(
+    ("column", "value", "says"),
+    [
+        ("status", [1, 2], "status '\\[1,? 2\\]' is unknown"),
+        ("number", [1, 2], "column number: whole numbers"),
+        ("number", 1.5, "column number: whole numbers"),
+        ("number", None, "column number: whole numbers"),
+        ("femur_mm", [1, 2], "column femur_mm: numbers were expected"),
+        ("femur_mm", "far", "column femur_mm: numbers were expected"),
+        ("femur_mm", -1.0, "column femur_mm: an error or a deviation cannot be below 0"),
+        ("femur_mm", float("inf"), "column femur_mm: holds an infinite number"),
+    ],
+)
+def test_columns_of_other_things(column: str, value: object, says: str, tmp_path: Path) -> None:
+    rows = made_up(4)
+    rows[column] = pd.Series([value] * 4)
+    rows.to_parquet(tmp_path / "runs.parquet")
+    with pytest.raises(InputError, match=says) as raised:
+        read_rows(tmp_path / "runs.parquet")
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("column", ["pelvis_trusted", "trusted", "reasons", "varied_bed", "host", "version_torch"])
+def test_lists_where_one_value_was_expected_are_text_or_not_trusted(column: str, tmp_path: Path) -> None:
+    rows = made_up(4)
+    rows[column] = pd.Series([["a", "b"]] * 4)
+    rows.to_parquet(tmp_path / "runs.parquet")
+    found = read_rows(tmp_path / "runs.parquet")[column].tolist()
+    assert found == [False] * 4 if column.endswith("trusted") else found == ["a; b"] * 4
+
+
 def test_groups_are_the_conditions_and_all_together() -> None:
     rows = pd.concat([made_up(3, condition="b"), made_up(2, condition="a b")], ignore_index=True)
     assert {name: len(part) for name, part in groups(rows).items()} == {"all": 5, "a b": 2, "b": 3}

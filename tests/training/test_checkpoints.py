@@ -6,7 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
+from models.unet import UNetSettings
+from models.weights import Weights, save_weights
 from training.checkpoints import last_good_checkpoint, read_checkpoint
 from training.module import NetworkTraining
 from training.run import Machine, train_network
@@ -24,7 +27,8 @@ def training(told: TrainingSettings) -> NetworkTraining:
 
 
 def written(path: Path, module: NetworkTraining, age: int) -> Path:
-    torch.save({"state_dict": module.state_dict(), "global_step": 5}, path)
+    state = {"epoch": 1, "loops": {}, "optimizer_states": [], "lr_schedulers": []}
+    torch.save({"state_dict": module.state_dict(), "global_step": 5, **state}, path)
     os.utime(path, (1000 - age, 1000 - age))
     return path
 
@@ -44,6 +48,15 @@ def test_a_truncated_checkpoint_is_told_and_passed_over(tmp_path: Path) -> None:
     best.write_bytes(b"")
     with pytest.raises(InputError, match="holds no whole checkpoint"):
         last_good_checkpoint(tmp_path, module, told.append)
+
+
+def test_weights_without_the_state_of_a_run_are_passed_over(tmp_path: Path) -> None:
+    module = training(settings())
+    best = written(tmp_path / "best.ckpt", module, 60)
+    torch.save({"state_dict": module.state_dict(), "global_step": 9}, tmp_path / "last.ckpt")
+    told: list[str] = []
+    assert last_good_checkpoint(tmp_path, module, told.append) == best
+    assert "last.ckpt: holds weights, but not the state of a run" in told[0]
 
 
 def test_a_checkpoint_of_other_channels_is_refused(tmp_path: Path) -> None:
@@ -69,6 +82,27 @@ def test_cuda_without_a_gpu_is_refused_before_anything_is_rendered(tmp_path: Pat
     with pytest.raises(InputError, match="--device cuda: 1 GPUs were asked for, torch sees 0"):
         train_network(settings(), [], tmp_path / "run", tmp_path / "cache", machine=Machine("cuda"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_weights_of_other_landmarks_to_start_with_are_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    other = {"classes": 7, "landmarks": 5, "channels": (2, 2), "convolutions": (1, 1)}
+    state = UNetSettings(**other).build().state_dict()
+    save_weights(tmp_path / "w.safetensors", Weights("multitask_unet", other, "hip", 1.25, state), {})
+    assert main(["train", "quick", "--out", str(tmp_path / "out"), "--start", str(tmp_path / "w.safetensors")]) == 2
+    told = capfd.readouterr().err
+    assert "5 landmarks" in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_word_in_place_of_a_list_is_told_briefly(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "quick", "--out", str(tmp_path / "out"), "--override", "x"]) == 2
+    told = capfd.readouterr().err
+    assert "list[str] was expected" in told
+    assert "class" not in told
+    assert told.count("\n") == 1
 
 
 @pytest.mark.parametrize(

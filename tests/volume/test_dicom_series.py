@@ -239,6 +239,7 @@ def test_a_scout_beside_one_series_is_passed_over_and_copies_count_once(tmp_path
         ("no position", "1 slices have no ImagePositionPatient"),
         ("one", "none of its DICOM series is a volume"),
         ("beside", "beside one straight line"),
+        ("no intercept", r"1 of 7 slices have no RescaleIntercept \(IM0244, …\)"),
         ("not HU", "Hounsfield"),
     ],
 )
@@ -252,6 +253,9 @@ def test_series_that_are_no_ct_are_told(tmp_path: Path, kind: str, message: str)
         for n, data in enumerate(slices):
             data.AcquisitionNumber, data.SOPInstanceUID = 2, generate_uid()
             data.save_as(folder / f"second_{n}")
+    elif kind == "no intercept":
+        slices[-1].RescaleIntercept = None
+        slices[-1].save_as(last)
     elif kind in ("uneven", "turned", "no position", "beside"):
         data = slices[-1]
         x, y, z = (float(v) for v in data.ImagePositionPatient)

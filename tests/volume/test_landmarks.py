@@ -173,6 +173,12 @@ def test_bad_fcsv(tmp_path: Path, change: tuple[str, str], message: str) -> None
         read_landmarks(tmp_path / "points.fcsv")
 
 
+def test_an_fcsv_that_is_another_table_names_the_point(tmp_path: Path) -> None:
+    (tmp_path / "points.fcsv").write_text("# Markups fiducial file version = 4.11\n1,2,3\n")
+    with pytest.raises(InputError, match=r"point 1 \(no name\): three finite numbers"):
+        read_landmarks(tmp_path / "points.fcsv")
+
+
 def test_a_missing_file_and_bytes_that_are_no_text(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_landmarks(tmp_path / "points.json")

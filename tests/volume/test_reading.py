@@ -260,6 +260,21 @@ def test_a_nifti_that_is_cut_off_is_refused(tmp_path: Path, suffix: str, dtype: 
         assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize(("axis", "size"), [(2, 0.0), (1, 4.0)])
+def test_a_nifti_whose_voxels_have_two_sizes_is_refused(axis: int, size: float, tmp_path: Path) -> None:
+    """ITK reads 1 mm where `pixdim` is 0, though the axes of the sform say 2 mm."""
+    image = nibabel.Nifti1Image(np.zeros((4, 5, 6), np.int16), np.diag([2.0, 2.0, 3.0, 1.0]))
+    image.header["qform_code"] = 0
+    image.header["sform_code"] = 1
+    nibabel.save(image, tmp_path / "ct.nii")
+    read_volume(tmp_path / "ct.nii")
+    content = bytearray((tmp_path / "ct.nii").read_bytes())
+    content[76 + 4 * axis : 80 + 4 * axis] = np.float32(size).tobytes()  # pixdim
+    (tmp_path / "ct.nii").write_bytes(bytes(content))
+    with pytest.raises(InputError, match=r"ct\.nii: its header tells voxels of"):
+        read_volume(tmp_path / "ct.nii")
+
+
 def test_a_nifti_that_only_claims_to_be_compressed_is_refused(tmp_path: Path) -> None:
     nibabel.save(nifti("int16"), tmp_path / "ct.nii")
     (tmp_path / "ct.nii").rename(tmp_path / "ct.nii.gz")

@@ -26,6 +26,7 @@ Surfaces = dict[str, trimesh.Trimesh]
 
 _SEARCH_PIXEL_MM = 1.0  # for finding the direction of the view
 _PIXEL_MM = 0.5
+_HEADS_APART_MM = 50.0  # centres of the femoral heads; some 170 in adults
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,13 @@ def _pelvic_frame(hips: Surfaces, heads: dict[str, Points]) -> tuple[Points, Poi
 
     The contact points of the plane (ASIS, front of the pubis) and its tilt are iterated until they agree.
     """
-    left = unit(heads["left"] - heads["right"])
+    apart = heads["left"] - heads["right"]
+    if not apart[0] > _HEADS_APART_MM:
+        raise InputError(
+            f"the left femoral head lies {apart[0]:.0f} mm left of the right one, at least {_HEADS_APART_MM:g} mm "
+            "were expected. Are sides and axes (LPS, mm) right?"
+        )
+    left = unit(apart)
     up = unit(np.array([0, 0, 1.0]) - left * left[2])
     middle = (heads["left"] + heads["right"]) / 2
     asis: dict[str, Points] = {}
@@ -95,6 +102,8 @@ def _pelvic_frame(hips: Surfaces, heads: dict[str, Points]) -> tuple[Points, Poi
 
 def _foremost(hip: trimesh.Trimesh, local: Points, region: NDArray[np.bool_]) -> Points:
     chosen = np.flatnonzero(region)
+    if not len(chosen):
+        raise InputError("a hip bone has no spine above the femoral heads, or no pubis. Are the axes LPS, in mm?")
     vertex: Points = hip.vertices[chosen[local[chosen, 1].argmin()]]
     return vertex
 

@@ -15,6 +15,7 @@ Points = NDArray[np.float64]
 
 BONES = ("hip_left", "hip_right", "sacrum", "femur_left", "femur_right")
 _MOST_BYTES = 2**30
+_SHORTEST_MM, _LONGEST_MM = 20.0, 700.0  # of a hip bone, sacrum or femur along any axis
 _ABOUT = ("source", "licence", "role")
 
 
@@ -55,6 +56,12 @@ def read_surfaces(path: Path) -> BoneSurfaces:
         faces, count = arrays[f"{bone}_faces"], len(arrays[f"{bone}_vertices"])
         if faces.size and (faces.min() < 0 or faces.max() >= count):
             raise InputError(f"{path}: `{bone}_faces` names a corner that is not among the vertices.")
+        for axis, extent in enumerate(np.ptp(arrays[f"{bone}_vertices"], axis=0) if count else (0, 0, 0)):
+            if not _SHORTEST_MM <= extent <= _LONGEST_MM:
+                raise InputError(
+                    f"{path}: `{bone}_vertices` span {extent:.3g} mm along {'xyz'[axis]}, but {_SHORTEST_MM:g} to "
+                    f"{_LONGEST_MM:g} mm were expected. Are they in mm?"
+                )
     bones = {
         bone: check_closed(
             trimesh.Trimesh(arrays[f"{bone}_vertices"].astype(float), arrays[f"{bone}_faces"], process=False),

@@ -1,5 +1,5 @@
 """Patients around the bones of a label map."""
 
-from sim.patient.from_labels.patient import make_label_patient, read_label_map, write_label_patient
+from sim.patient.from_labels.patient import make_label_patient, write_label_patient
 
 __all__ = ["make_label_patient", "read_label_map", "write_label_patient"]

@@ -91,7 +91,7 @@ class _Grid:
     spacing: Points
 
 
-def _mask(volume: NDArray[np.uint8], table: LabelTable, *bones: str) -> Mask:
+def _mask(volume: NDArray[np.integer], table: LabelTable, *bones: str) -> Mask:
     """The voxels of some bones."""
     for bone in bones:
         if bone not in table:

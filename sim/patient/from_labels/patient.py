@@ -3,13 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk
 import torch
 
 from femoreg_torch.anatomy import HIP, LabelTable
-from femoreg_torch.errors import InputError
 from femoreg_torch.files import new_folder
-from femoreg_torch.volume import Volume
+from femoreg_torch.volume import Volume, read_label_map
 from sim.patient.from_labels.bones import skeleton_from_labels
 from sim.patient.landmarks import find_landmarks
 from sim.patient.parameters import draw_parameters
@@ -41,24 +39,6 @@ def make_label_patient(labels: Volume, bones: LabelTable, seed: int, spacing_mm:
     points = {name: torch.from_numpy(landmarks[name] + centre) for name in HIP.landmark_names}
     drawn = {name: float(getattr(parameters, name)) for name in ("bone_density", "cortex", "habitus")}
     return Patient(moved(ct), moved(numbers), points, drawn)
-
-
-def read_label_map(path: Path) -> Volume:
-    """A label map (uint8) without the CT that it was drawn on; axes turned to run closest to +L, +P, +S.
-
-    Raises `InputError` for a file that is not one.
-    """
-    try:
-        image = sitk.DICOMOrient(sitk.ReadImage(str(path)), "LPS")
-    except RuntimeError as error:
-        raise InputError(f"{path}: cannot be read as a label map in NIfTI, NRRD or MHA.") from error
-    data = sitk.GetArrayFromImage(image)
-    if data.ndim != 3 or data.dtype.kind not in "iu" or data.min() < 0 or data.max() > 255:
-        raise InputError(f"{path}: a 3-D volume of whole numbers from 0 to 255 was expected.")
-    affine = np.eye(4)
-    affine[:3, :3] = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
-    affine[:3, 3] = image.GetOrigin()
-    return Volume(torch.from_numpy(data.astype(np.uint8)), torch.from_numpy(affine))
 
 
 def write_label_patient(path: Path, bones: LabelTable, out: Path, seed: int, spacing_mm: float = 1.0) -> None:

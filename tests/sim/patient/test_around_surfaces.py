@@ -97,6 +97,13 @@ def test_a_file_that_does_not_fit_is_named(surfaces: dict[str, trimesh.Trimesh],
     hole = trimesh.Trimesh(surfaces["sacrum"].vertices, surfaces["sacrum"].faces[1:], process=False)
     with pytest.raises(InputError, match="sacrum: the mesh is open"):
         read_surfaces(_written(tmp_path / "open.npz", surfaces | {"sacrum": hole}))
+    for factor in (0.001, 1000.0):
+        scaled = trimesh.Trimesh(surfaces["femur_left"].vertices * factor, surfaces["femur_left"].faces, process=False)
+        with pytest.raises(InputError, match=r"femur_left_vertices.*Are they in mm"):
+            read_surfaces(_written(tmp_path / "scaled.npz", surfaces | {"femur_left": scaled}))
+    swapped = surfaces | {"femur_left": surfaces["femur_right"], "femur_right": surfaces["femur_left"]}
+    with pytest.raises(InputError, match="left femoral head"):
+        find_surface_landmarks(swapped)
     whole = read_surfaces(_written(tmp_path / "whole.npz", surfaces))
     assert (whole.name, whole.licence, whole.role) == ("whole", "none", "unknown")
 

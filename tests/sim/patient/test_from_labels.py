@@ -8,9 +8,18 @@ import torch
 from numpy.typing import NDArray
 
 from femoreg_torch.anatomy import label_table
+from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
-from femoreg_torch.volume import Volume, axis_aligned, read_ct, read_labels, read_landmarks, write_volume
-from sim.patient.from_labels import read_label_map, write_label_patient
+from femoreg_torch.volume import (
+    Volume,
+    axis_aligned,
+    read_ct,
+    read_label_map,
+    read_labels,
+    read_landmarks,
+    write_volume,
+)
+from sim.patient.from_labels import write_label_patient
 from sim.patient.from_labels.bones import skeleton_from_labels
 from sim.patient.landmarks import find_landmarks
 from sim.patient.parameters import draw_parameters
@@ -125,3 +134,14 @@ def test_what_is_missing_is_named(labels: Volume, tmp_path: Path) -> None:
     turned = Volume(labels.data, torch.diag(torch.tensor([-1.5, 1.5, 3.0, 1.0], dtype=torch.float64)))
     with pytest.raises(InputError, match="axes"):
         skeleton_from_labels(turned, TABLE)
+
+
+def test_a_damaged_map_prints_nothing_beside_the_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Without its magic number a NIfTI file is of Analyze 7.5, of which ITK complains on stderr."""
+    path = tmp_path / "map.nii"
+    write_volume(path, Volume(torch.ones(4, 4, 4, dtype=torch.uint8), torch.eye(4, dtype=torch.float64)))
+    content = path.read_bytes()
+    path.write_bytes(content[:344] + bytes(4) + content[348:])
+    assert main(["around-labels", str(path), "--labels", "pelvic_ref", "--out", str(tmp_path / "out")]) == 2
+    assert capfd.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,73 @@
+"""`femoreg train` on a disk that fails at the n-th step: one line, and the next start goes on or begins anew."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from fuzz_faults import FAULT, fault
+
+from femoreg_torch.commands.main import main
+from femoreg_torch.detect import load_network
+from training.checkpoints import read_checkpoint
+from training.commands import train
+
+SETTINGS = """
+cohort: {patient_seeds: [], validation_seeds: [], case_variants: 1, views: 2}
+network: {kind: multitask_unet, channels: [4, 8], convolutions: [1, 1]}
+loss: {kind: multitask}
+optimisation: {epochs: 1, batches_per_epoch: 1, batch_size: 1}
+workers: 0
+"""
+MOST_STEPS = 400
+
+
+@pytest.fixture(scope="module")
+def prepared(case: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """The command line but for `--out`; its views are rendered."""
+    folder = tmp_path_factory.mktemp("prepared")
+    (folder / "tiny.yaml").write_text(SETTINGS)
+    train(str(folder / "tiny.yaml"), out=folder / "first", cases=[case], cache=folder / "cache")
+    return ["train", str(folder / "tiny.yaml"), "--cases", f"[{case}]", "--cache", str(folder / "cache")]
+
+
+def whole(out: Path) -> None:
+    """What stands in the folder of a run is whole."""
+    for path in out.glob("checkpoints/*.ckpt"):
+        read_checkpoint(path)
+    if (out / "hip14.safetensors").exists():
+        load_network(out / "hip14.safetensors")
+    if (out / "settings.json").exists():
+        json.loads((out / "settings.json").read_text())
+
+
+def failing_at(n: int, prepared: list[str], out: Path, capsys: pytest.CaptureFixture[str]) -> bool:
+    """Train while the n-th step of writing fails, then once more; whether there were so many steps."""
+    with fault(out, n):
+        status = main([*prepared, "--out", str(out)])
+        happened = FAULT.left == 0
+    told = capsys.readouterr().err
+    assert (status, told.count("\n")) in ((0, 0), (2, 1)), told
+    assert "defect" not in told, told
+    assert status == 0 or happened, told
+    whole(out)
+    if status:
+        again = ["--resume"] if any(out.glob("checkpoints/*.ckpt")) else []
+        status = main([*prepared, "--out", str(out), *again])
+        assert (status, capsys.readouterr().err) == (0, "")
+        load_network(out / "hip14.safetensors")
+        assert again or [path.name for path in (out / "csv").iterdir()] == ["version_0"]  # not mixed with what failed
+        assert [path.name for path in out.parent.glob(".*")] + [path.name for path in out.rglob(".*")] == []
+    shutil.rmtree(out)
+    return happened
+
+
+@pytest.mark.parametrize("n", [1, 3, 9])
+def test_a_step_that_fails(n: int, prepared: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert failing_at(n, prepared, tmp_path / "out", capsys)
+
+
+@pytest.mark.long
+def test_every_step_that_fails(prepared: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    steps = next(n for n in range(1, MOST_STEPS) if not failing_at(n, prepared, tmp_path / "out", capsys))
+    assert steps > 10
