@@ -49,6 +49,7 @@ class Sight:
     view: int  # from 0
     image: str  # its file, for the reader
     pixel: tuple[float, float]  # column, row
+    spread: float = 1.0  # its deviation, in those of a shadow that nothing disturbs
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ class Bundle:
     sights: tuple[Sight, ...]  # that were given
     used: NDArray[np.bool_]  # (S,) those that are not outliers
     residuals_px: Array  # (S, 2) drawn minus seen, of all
-    deviation_px: float  # of a shadow along each axis
+    deviation_px: float  # of a shadow of spread 1 along each axis
     estimated: bool  # whether from the residuals
     redundancy: float  # of the used shadows: how many numbers more than needed
     objects: tuple[str, ...]  # in the order of the covariance
@@ -82,8 +83,8 @@ def bundle(
     """The most probable poses of all objects and views, from shadows whose beads are known.
 
     `start` has a pose of every object and of every view that is seen; of its views none may be without a shadow.
-    `deviation_px` is that of a shadow along each axis; None: estimated. Raises `InputError` if an object or a view is
-    left with too few shadows.
+    `deviation_px` is that of a shadow of spread 1 along each axis; None: estimated. Raises `InputError` if an object
+    or a view is left with too few shadows.
     """
     state = _State(start, torch.zeros(sum(len(thing) for thing in beads), 3, dtype=torch.float64))
     problem = _Problem(beads, sights, camera, len(start.camera_from_camera1))
@@ -94,14 +95,14 @@ def bundle(
         state, fit = problem.solved(state, used, sigma, robust=True)
         before, old = used, sigma
         if deviation_px is None:
-            sigma = _robust(problem.residuals_px(state)[used], fit, sigma)
-        used = np.linalg.norm(problem.residuals_px(state), axis=1) <= _OUTSIDE * sigma * np.sqrt(2)
+            sigma = _robust(problem.even_px(state)[used], fit, sigma)
+        used = np.linalg.norm(problem.even_px(state), axis=1) <= _OUTSIDE * sigma * np.sqrt(2)
         if (used == before).all() and abs(sigma / old - 1) < _SETTLED:
             break
     problem.check(used)
     state, fit = problem.solved(state, used, sigma)
     for _ in range(_ROUNDS if deviation_px is None else 0):
-        old, sigma = sigma, _estimated(problem.residuals_px(state)[used], fit, sigma)
+        old, sigma = sigma, _estimated(problem.even_px(state)[used], fit, sigma)
         state, fit = problem.solved(state, used, sigma)
         if abs(sigma / old - 1) < _SETTLED:
             break
@@ -199,7 +200,12 @@ class _Problem:
     @cached_property
     def deviations_mm(self) -> Array:
         """Of the place of each bead (N,)."""
-        return np.concatenate([np.full(len(thing), thing.deviation_mm) for thing in self.beads])
+        return torch.cat([thing.deviations_mm for thing in self.beads]).double().numpy()
+
+    @cached_property
+    def spreads(self) -> Array:
+        """Of every sight (S, 1)."""
+        return np.array([[sight.spread] for sight in self.sights])
 
     def check(self, used: NDArray[np.bool_]) -> None:
         """Raises `InputError` if an object or a view has too few shadows left."""
@@ -248,6 +254,10 @@ class _Problem:
     def residuals_px(self, state: _State) -> Array:
         """Drawn minus seen (S, 2)."""
         return (project_points(self.camera, self.places(state)[1]) - self.seen).numpy()
+
+    def even_px(self, state: _State) -> Array:
+        """The same by each shadow's spread: all have one deviation."""
+        return np.asarray(self.residuals_px(state) / self.spreads)
 
     def jacobian_px(self, state: _State) -> Array:
         """Derivatives (S, 2, unknowns) of the drawn pixels by all unknowns."""
@@ -308,7 +318,7 @@ class _Problem:
         """Residuals in deviations, weighted by Huber's rule where asked, and the cost that they stand for."""
         free = self.deviations_mm > 0
         own = (state.shifts.numpy()[free] / self.deviations_mm[free, None]).ravel()
-        shadows = self.residuals_px(state)[used] / sigma
+        shadows = self.even_px(state)[used] / sigma
         length = np.linalg.norm(shadows, axis=1, keepdims=True)
         if not np.isfinite(length).all():  # a bead behind the source
             return np.full(shadows.size + own.size, np.inf), np.inf
@@ -318,9 +328,9 @@ class _Problem:
         return np.concatenate([(np.sqrt(weights) * shadows).ravel(), own]), float(loss.sum() + (own**2).sum())
 
     def _jacobian(self, state: _State, used: NDArray[np.bool_], sigma: float, robust: bool) -> Array:
-        rows = self.jacobian_px(state)[used] / sigma
+        rows = (self.jacobian_px(state) / self.spreads[..., None])[used] / sigma
         if robust:
-            length = np.linalg.norm(self.residuals_px(state)[used] / sigma, axis=1, keepdims=True)
+            length = np.linalg.norm(self.even_px(state)[used] / sigma, axis=1, keepdims=True)
             rows = rows * np.sqrt(self._weights(length))[..., None]
         deviations = np.repeat(self.deviations_mm[self.deviations_mm > 0], 3)
         own = np.zeros((len(deviations), rows.shape[2]))

@@ -20,7 +20,7 @@ from femoreg_torch.volume import read_landmarks
 
 COLUMNS = ("image", "bead", "column_px", "row_px")
 IN_CT = "ct"
-_BY_HAND_MM, _MEASURED_MM = 0.2, 0.05  # deviations of bead centres along an axis: picked, and fitted in the CT
+_BY_HAND_MM = 0.2  # deviation of a bead's centre along an axis where a person has picked it
 _AROUND_MM = 4.0  # of the bone's labels, which is searched too: a label map may leave out a bead's voxels
 
 
@@ -72,7 +72,7 @@ def _object(fields: Fields, name: str, case: Case, folder: Path) -> Beads:
     diameter = _positive(fields, "diameter_mm")
     searched = fields.text("points", "a file of points, or `ct`") == IN_CT
     if searched:
-        points = _in_ct(fields, name, case, diameter)
+        points, deviations = _in_ct(fields, name, case, diameter)
         named = {f"{name}{number}": point for number, point in enumerate(points, 1)}
     else:
         if "count" in fields:
@@ -80,12 +80,14 @@ def _object(fields: Fields, name: str, case: Case, folder: Path) -> Beads:
         named = read_landmarks(fields.file_path("points", folder), None)
     points = torch.stack(list(named.values()))
     check_beads(points, fields.where("points"))
-    noise = _positive(fields, "noise_mm", or_zero=True) if "noise_mm" in fields else None
-    deviation = (_MEASURED_MM if searched else _BY_HAND_MM) if noise is None else noise
-    return Beads(name, tuple(named), points, diameter, deviation)
+    if not searched:
+        deviations = torch.full((len(points),), _BY_HAND_MM, dtype=torch.float64)
+    if "noise_mm" in fields:
+        deviations = torch.full((len(points),), _positive(fields, "noise_mm", or_zero=True), dtype=torch.float64)
+    return Beads(name, tuple(named), points, diameter, deviations)
 
 
-def _in_ct(fields: Fields, name: str, case: Case, diameter_mm: float) -> Tensor:
+def _in_ct(fields: Fields, name: str, case: Case, diameter_mm: float) -> tuple[Tensor, Tensor]:
     thing = case.objects[name]
     if thing.model is not None:
         raise InputError(

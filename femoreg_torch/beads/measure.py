@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.beads.bundle import Bundle, Sight, bundle
+from femoreg_torch.beads.edges import beside_metal, read_metal
 from femoreg_torch.beads.given import Given, Mark
 from femoreg_torch.beads.matching import Match, match_beads
 from femoreg_torch.beads.model import Beads
@@ -24,6 +25,7 @@ from femoreg_torch.registration.prepare import ByKind, read_images
 
 _DEPTH = 0.7  # of the source-to-detector distance, where nothing says where an object is
 _REGISTERED_MM, _NOMINAL_MM, _SAME_CAMERA_MM, _PLACED_MM = 10.0, 40.0, 2.0, 5.0  # gates, on the detector
+_AGAIN = 2  # rounds: edges are drawn where the round before has left the device
 _TAKEN_MM = 1.0  # from where a bead of another object is seen, on the detector
 
 Report = Callable[[str], None]
@@ -72,6 +74,15 @@ def measure(case: Case, given: Given, rough: Poses | None = None, report: Report
     everywhere = Poses(torch.stack([worker.cameras[view] for view in known]), worker.placed)
     sights = [replace(sight, view=known.index(sight.view)) for sight in worker.sights]
     found = whole = bundle(given.beads, sights, everywhere, case.carm.camera, given.noise_px)
+    models = {name: case.objects[name].model for name in whole.poses.camera1_from}
+    metal = {name: read_metal(model) for name, model in models.items() if model is not None}
+    if given.marks is None and any(metal.values()):
+        report("shadows beside metal")
+        shown = {kind: tuple(of_views[view] for view in known) for kind, of_views in images.items()}
+        at = replace(case, views=tuple(case.views[view] for view in known))
+        for _ in range(_AGAIN):
+            sights = beside_metal(sights, at, shown, given.beads, metal, whole.poses)
+            found = whole = bundle(given.beads, sights, whole.poses, case.carm.camera, given.noise_px)
     if given.first_view_only:
         first = [sight for sight in sights if sight.view == 0]
         found = bundle(given.beads, first, everywhere.first_views(1), case.carm.camera, given.noise_px)
@@ -141,7 +152,9 @@ class _Matcher:
     ) -> tuple[Tensor, Match]:
         pixels, labels = self._shadows(thing, view, kind, name, rough)
         where = f"beads of {thing.object} in {name}"
-        return pixels, match_beads(thing.points, pixels, self.camera, rough, gate_mm, thing.deviation_mm, labels, where)
+        return pixels, match_beads(
+            thing.points, pixels, self.camera, rough, gate_mm, float(thing.deviations_mm.max()), labels, where
+        )
 
     def _shadows(
         self, thing: Beads, view: int, kind: str, name: str, rough: Tensor | None

@@ -21,7 +21,7 @@ class Beads:
     names: tuple[str, ...]
     points: Tensor  # (N, 3) float64, centres
     diameter_mm: float
-    deviation_mm: float  # standard deviation of a centre along each axis
+    deviations_mm: Tensor  # (N,) float64, standard deviation of each centre along each axis
 
     def __len__(self) -> int:
         return len(self.names)

@@ -101,18 +101,18 @@ def find_spots(attenuation: Tensor, radius_px: float, field: Tensor | None = Non
     return Spots(table[:, :2], table[:, 2], table[:, 3], table[:, 4])
 
 
-def _window(radius_px: float, blur_px: float) -> int:
+def window_px(radius_px: float, blur_px: float = BLUR_PX) -> int:
     """Radius of the window, whole pixels."""
     return int(np.ceil(_WINDOW_RADII * radius_px + 3 * blur_px / 2 + _MARGIN_PX))
 
 
-def _disc(half: int) -> tuple[Array, Array, NDArray[np.bool_]]:
+def disc(half: int) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Columns and rows (n, n) from the middle, and which lie in the round window."""
     rows, columns = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float64)
     return columns, rows, np.hypot(columns, rows) <= half + 0.5
 
 
-def _surface(columns: Array, rows: Array, half: float) -> Array:
+def quadratic(columns: Array, rows: Array, half: float) -> Array:
     """A quadratic surface's six terms (N, 6) at pixels (N,)."""
     u, v = columns / half, rows / half
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], 1)
@@ -120,19 +120,19 @@ def _surface(columns: Array, rows: Array, half: float) -> Array:
 
 def _matched(image: Array, radius_px: float, blur_px: float) -> tuple[Array, Array]:
     """At every pixel: the amount of shadow beside a quadratic surface, and their correlation in the window."""
-    half = _window(radius_px, blur_px)
-    columns, rows, disc = _disc(half)
-    basis, _ = np.linalg.qr(_surface(columns[disc], rows[disc], half))
-    expected = shadow(radius_px, np.hypot(columns, rows)[disc], blur_px)
+    half = window_px(radius_px, blur_px)
+    columns, rows, inside = disc(half)
+    basis, _ = np.linalg.qr(quadratic(columns[inside], rows[inside], half))
+    expected = shadow(radius_px, np.hypot(columns, rows)[inside], blur_px)
     alone = expected - basis @ (basis.T @ expected)
 
     def filtered(values: Array, picture: Array) -> Array:
-        kernel = np.zeros(disc.shape)
-        kernel[disc] = values
+        kernel = np.zeros(inside.shape)
+        kernel[inside] = values
         return np.asarray(cv2.filter2D(picture, cv2.CV_64F, kernel, borderType=cv2.BORDER_REFLECT))
 
     level = image - image.mean()  # squares of large numbers would cancel
-    left = filtered(np.ones(disc.sum()), level**2) - sum(filtered(column, level) ** 2 for column in basis.T)
+    left = filtered(np.ones(inside.sum()), level**2) - sum(filtered(column, level) ** 2 for column in basis.T)
     hit = filtered(alone, level)
     norm = float((alone**2).sum())
     floor = 1e-9 * max(float(np.max(left)), 1e-30)
@@ -141,13 +141,13 @@ def _matched(image: Array, radius_px: float, blur_px: float) -> tuple[Array, Arr
 
 def _refined(image: Array, column: int, row: int, radius_px: float, blur_px: float) -> Array | None:
     """(column, row, radius, contrast, correlation) of the shadow near a pixel; None if there is none."""
-    half = _window(radius_px, blur_px)
+    half = window_px(radius_px, blur_px)
     if not (half <= column < image.shape[1] - half and half <= row < image.shape[0] - half):
         return None
-    columns, rows, disc = _disc(half)
-    u, v = columns[disc], rows[disc]
-    values = image[row - half : row + half + 1, column - half : column + half + 1][disc]
-    surface = _surface(u, v, half)
+    columns, rows, inside = disc(half)
+    u, v = columns[inside], rows[inside]
+    values = image[row - half : row + half + 1, column - half : column + half + 1][inside]
+    surface = quadratic(u, v, half)
     weights = np.ones(len(values))
 
     def solved(parameters: Array, weights: Array) -> tuple[Array, Array, Array]:

@@ -65,7 +65,9 @@ def uncertainty_content(case: Case, found: Measured) -> dict[str, object]:
         "version": _VERSION,
         "image_noise_px": bundle.deviation_px,
         "image_noise_estimated": bundle.estimated,
-        "bead_noise_mm": {thing.object: thing.deviation_mm for thing in found.beads},
+        "bead_noise_mm": {
+            thing.object: dict(zip(thing.names, thing.deviations_mm.tolist(), strict=True)) for thing in found.beads
+        },
         "reprojection_rms_px": bundle.rms_px,
         "redundancy": bundle.redundancy,
         "shadows": {"used": int(bundle.used.sum()), "given": len(bundle.sights)},

@@ -284,7 +284,8 @@ def _by_hand(
         true = torch.tensor(placed[thing.object], dtype=torch.float64)
         shift = hand.bead_noise_mm * torch.randn(true.shape, generator=generator, dtype=torch.float64)
         names = tuple(map(str, range(len(true))))
-        picked.append(Beads(thing.object, names, true + shift, thing.diameter_mm, hand.bead_noise_mm))
+        noise = torch.full((len(true),), hand.bead_noise_mm, dtype=torch.float64)
+        picked.append(Beads(thing.object, names, true + shift, thing.diameter_mm, noise))
         exact = project_points(camera, transform_points(case.truth.camera1_from[thing.object], true))
         seen = exact + hand.image_noise_px * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
         sights += [Sight(thing.object, n, 0, "view 1", (c, r)) for n, (c, r) in enumerate(seen.tolist())]

@@ -1,29 +1,43 @@
 """How far off the pelvis may start: success of the first view's stages against rotation, depth and shift."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 
-from femoreg_torch.case import read_case
+from femoreg_torch.case import Case, read_case
 from femoreg_torch.case.femoroplasty import PELVIS
 from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation import errors, reference_points
-from femoreg_torch.files import temporary_file, write_json
+from femoreg_torch.evaluation import ReferencePoints, errors, reference_points
+from femoreg_torch.files import plain, temporary_file
 from femoreg_torch.registration import Plan, prepare_scene, run_plan
 from femoreg_torch.registration.plan import Stage
+from femoreg_torch.registration.scene import Scene
 from femoreg_torch.statistics.figures import write_figures
 from femoreg_torch.statistics.formats import pipe_table
+from femoreg_torch.statistics.rows import DONE, VARIED
 from sim.study.capture_figure import capture_figure
+from sim.study.cases import Stores
+from sim.study.code import digest
+from sim.study.conditions import Imaged, body_of, made_once
 from sim.study.page import machine, write_section
+from sim.study.procedures import Procedure
+from sim.study.record import Record
 from sim.study.starts import Offset, displaced
+from sim.study.store import Run
+from sim.study.study import Study
+from sim.study.trial import kind
+from sim.study.work import Setting
 
 SUCCESS_MM, SUCCESS_DEG = 10.0, 2.0  # one view leaves millimetres of depth; the stages after it settle them
 FULL = {"rotation": 30.0, "depth": 100.0, "lateral": 40.0}  # degrees, mm, mm
 LEVELS = (0.2, 0.4, 0.6, 0.8, 1.0)  # shares of these, singly and, as `jointly`, all at once
+_SHARES = (0.0, *LEVELS)
+_OF_TRUTH = "rotation"  # the sweep among whose runs are those from the truth, where all sweeps begin
 AXIS_LABELS = {
     "rotation": "rotation, °",
     "depth": "depth, mm",
@@ -46,75 +60,102 @@ def first_stages(plan: Plan) -> Plan:
     return replace(plan, steps=steps)
 
 
-def sweep_starts(cases: Sequence[Path], plan: Plan, starts: int) -> list[dict[str, Any]]:
-    """One record per start: `starts` of them at every level of every sweep, spread evenly over the cases.
+@dataclass(frozen=True)
+class Displaced:
+    """The first view's stages on kept cases, from starts off the truth that their runs tell by what is varied."""
 
-    A record holds sweep, share, case, the offset and the errors of the pelvis afterwards.
+    setting: Setting
+    stores: Stores
+    imaged: Imaged
+
+    def __call__(self, procedure: Procedure, scratch: Path) -> Callable[[Run], Record]:
+        setting = self.setting
+        body = body_of(procedure, self.stores, self.imaged, scratch)
+        case = read_case(made_once(setting.variation, procedure, setting.simulation, body, self.imaged))
+        scene, points = prepare_scene(replace(case, views=case.views[:1])), reference_points(case)
+        plan = first_stages(setting.plan)
+        return lambda run: _started(case, scene, points, plan, dict(run.varied))
+
+
+def _started(case: Case, scene: Scene, points: ReferencePoints, plan: Plan, varied: dict[str, Any]) -> Record:
+    assert case.truth is not None  # of a simulated case
+    truth, start = case.truth.first_views(1), varied["start"]
+    by = offset(varied["sweep"], varied["share"])
+    generator = torch.Generator().manual_seed(1000 * _SHARES.index(varied["share"]) + start)
+    pose = displaced(truth.camera1_from[PELVIS], scene.objects[PELVIS].reference_point, by, generator)
+    poses = run_plan(scene, plan, pose, start, lambda *_: None).poses
+    found: Record = plain(
+        {
+            "refused": None,
+            "trusted": False,
+            "reasons": ["the first view's stages alone were run; nothing was assessed"],
+            "asked": [PELVIS],
+            "errors": {PELVIS: errors(truth, poses, points)[PELVIS]},
+        }
+    )
+    return found
+
+
+def plan_capture(setting: Setting, chosen: Sequence[Procedure], stores: Stores, imaged: Imaged, starts: int) -> Study:
+    """`starts` runs at every level of every sweep, spread evenly over the procedures; the truth is one for all sweeps.
+
+    Raises `InputError` for a plan that does not begin in view 1.
     """
-    plan = first_stages(plan)
-    records = []
-    for number, folder in enumerate(cases):
-        case = read_case(folder)
-        if case.truth is None:
-            raise InputError(f"{folder}: has no truth to start from.")
-        one_view = replace(case, views=case.views[:1])
-        scene = prepare_scene(one_view)
-        points = reference_points(case)
-        truth = case.truth.first_views(1)
-        for sweep in AXIS_LABELS:
-            for level, share in enumerate((0.0, *LEVELS)):
-                if share == 0 and sweep != "rotation":
-                    continue  # the truth is the same start in every sweep
-                by = offset(sweep, share)
-                for start in range(number, starts, len(cases)):
-                    generator = torch.Generator().manual_seed(1000 * level + start)
-                    centre = scene.objects[PELVIS].reference_point
-                    pose = displaced(truth.camera1_from[PELVIS], centre, by, generator)
-                    poses = run_plan(scene, plan, pose, start, lambda *_: None).poses
-                    row = errors(truth, poses, points)[PELVIS]
-                    records.append({"sweep": sweep, "share": share, "case": folder.name, **asdict(by), "pelvis": row})
-            print(f"{folder.name}: {sweep} done", flush=True)
-    return records
+    first_stages(setting.plan)
+    runs = [
+        Run(
+            "capture_range",
+            f"{sweep}{100 * share:.0f}_start{start}",
+            procedure,
+            digest(FULL, share, start, setting.digest),
+            kind(procedure),
+            setting.plan.preset,
+            (("sweep", sweep), ("share", share), ("start", start), *asdict(offset(sweep, share)).items()),
+        )
+        for place, procedure in enumerate(chosen)
+        for sweep in AXIS_LABELS
+        for share in (_SHARES if sweep == _OF_TRUTH else LEVELS)
+        for start in range(place, starts, len(chosen))
+    ]
+    return Study(runs, Displaced(setting, stores, imaged))
 
 
-def succeeded(record: dict[str, Any]) -> bool:
-    """Whether the pelvis came within 10 mm and 2° of the truth."""
-    return record["pelvis"]["mm"] <= SUCCESS_MM and record["pelvis"]["deg"] <= SUCCESS_DEG
+def success_rates(rows: pd.DataFrame) -> dict[str, list[tuple[float, int, int]]]:
+    """(offset, successes, starts) of every level of every sweep; each begins with the starts at the truth.
 
-
-def success_rates(records: Sequence[dict[str, Any]]) -> dict[str, list[tuple[float, int, int]]]:
-    """(offset, successes, starts) of every level of every sweep; each begins with the starts at the truth."""
+    Success: the pelvis within 10 mm and 2° of the truth. Runs that a defect has ended are left out.
+    """
+    done = rows[rows["status"].eq(DONE)]
+    share, sweep = done[f"{VARIED}share"], done[f"{VARIED}sweep"]
+    good = done[f"{PELVIS}_mm"].le(SUCCESS_MM) & done[f"{PELVIS}_deg"].le(SUCCESS_DEG)
     rates: dict[str, list[tuple[float, int, int]]] = {}
-    for sweep in AXIS_LABELS:
-        rates[sweep] = []
-        for share in (0.0, *LEVELS):
-            here = [r for r in records if r["share"] == share and (r["sweep"] == sweep or share == 0)]
-            if here:
-                rates[sweep].append((share * FULL.get(sweep, 100.0), sum(map(succeeded, here)), len(here)))
+    for name in AXIS_LABELS:
+        rates[name] = []
+        for level in _SHARES:
+            here = good[share.eq(level) & (sweep.eq(name) | (level == 0))]
+            if len(here):
+                rates[name].append((level * FULL.get(name, 100.0), int(here.sum()), len(here)))
     return rates
 
 
-def write_capture(records: Sequence[dict[str, Any]], plan: Plan, out: Path, docs: Path | None) -> str:
-    """Write records and figure into `out`, and a section with the figure into `docs`, if given. Returns the section."""
-    out.mkdir(parents=True, exist_ok=True)
-    rates = success_rates(records)
+def write_capture(rows: pd.DataFrame, plan: Plan, out: Path, docs: Path | None) -> str:
+    """Write the figure into `out`, and a section with it into `docs`, if given. Returns the section."""
+    rates = success_rates(rows)
     names = ", ".join(f"“{step.name}”" for step in first_stages(plan).steps)
-    cases = sorted({record["case"] for record in records})
     title = f"Capture range of the pelvis in view 1, {plan.preset}"
     (picture,) = write_figures([capture_figure(rates, AXIS_LABELS, f"capture_{plan.preset}", title)], out)
-    write_json(out / f"capture_{plan.preset}.json", {"preset": plan.preset, "starts": list(records)})
-    rows = [
+    lines = [
         [sweep, *(f"{value:g}: {good} of {starts}" for value, good, starts in points)]
         for sweep, points in rates.items()
     ]
     text = "\n\n".join(
         [
             f"`make capture-range PRESET={plan.preset}`: the stages of the first view ({names}) from starts off the "
-            f"truth, on {len(cases)} simulated procedures. Success: the middle of the pelvis within {SUCCESS_MM:g} mm "
-            f"and its rotation within {SUCCESS_DEG:g}° afterwards; the femur starts as the CT has it. Shaded: 95 % "
-            "interval.",
+            f"truth, on {rows['number'].nunique()} simulated procedures. Success: the middle of the pelvis within "
+            f"{SUCCESS_MM:g} mm and its rotation within {SUCCESS_DEG:g}° afterwards; the femur starts as the CT has "
+            "it. Shaded: 95 % interval.",
             f"![Success rate against start offset](capture_{plan.preset}.png)",
-            pipe_table(("offset: successes", *([""] * (len(LEVELS) + 1))), rows),
+            pipe_table(("offset: successes", *([""] * (len(LEVELS) + 1))), lines),
             f"Jointly: % of {FULL['rotation']:g}°, {FULL['depth']:g} mm and {FULL['lateral']:g} mm at once. "
             f"Measured on: {machine()}",
         ]

@@ -1,6 +1,8 @@
 """Where the batches of a study are done: in processes of this machine (joblib, loky), or on a cluster (Dask)."""
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from joblib import delayed
@@ -71,7 +73,7 @@ class OnCluster:
                 f"--scheduler {self.address}: does not answer ({' '.join(str(error).split())}). Give the address that "
                 "`dask scheduler` prints."
             ) from error
-        with client:
+        with _quiet("distributed.client"), client:
             _check_workers(client.scheduler_info(n_workers=-1)["workers"], self.address)
             waiting = {client.submit(_perform, work, store, batch, pure=False): (batch, batch) for batch in todo}
             finished = as_completed(waiting, loop=client.loop)
@@ -93,6 +95,18 @@ class OnCluster:
                 elif failure is not None:
                     raise failure
                 done(whole)
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Without what a library logs of failures that its exceptions tell as well."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def _check_workers(workers: dict[str, dict[str, int]], address: str) -> None:

@@ -161,7 +161,7 @@ def run_study(
             _build_patients(study, todo)
             try:
                 carry_out(study.work, store, batches(todo), executor, advance)
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, InputError):  # the latter where a cluster has gone
                 write_table(out / TABLE_NAME, _records(store, study.runs, reuse))
                 raise
             records = _records(store, study.runs, reuse)

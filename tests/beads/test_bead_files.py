@@ -43,7 +43,7 @@ def test_points_of_slicer_and_of_the_plain_format(case: Case) -> None:
     torch.testing.assert_close(femur.points, FEMUR)
     torch.testing.assert_close(device.points, DEVICE)
     assert femur.names == tuple(f"f{n}" for n in range(7))
-    assert (femur.deviation_mm, device.deviation_mm) == (0.2, 0.0)
+    assert (femur.deviations_mm.tolist(), device.deviations_mm.tolist()) == ([0.2] * 7, [0.0] * 5)
     assert (given.noise_px, given.first_view_only, given.marks) == (0.7, True, None)
 
 

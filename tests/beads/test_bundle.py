@@ -1,5 +1,7 @@
 """All views at once: exact input, covariance against Monte Carlo, outliers, and what is left open."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -35,7 +37,7 @@ def beads(deviation_mm: float = 0.0) -> list[Beads]:
     """Of both objects."""
     names = ("abcdefg", "ABCDE")
     return [
-        Beads(name, tuple(letters), points, 1.0, deviation_mm)
+        Beads(name, tuple(letters), points, 1.0, torch.full((len(points),), deviation_mm, dtype=torch.float64))
         for name, letters, points in zip(("femur", "device"), names, (FEMUR, DEVICE), strict=True)
     ]
 
@@ -196,3 +198,16 @@ def test_an_object_that_no_pose_fits_is_told() -> None:
     with pytest.raises(InputError, match=r"beads of device: \d agree") as caught:
         bundle(beads(), scattered, off(), CAMERA, 0.3)
     assert "\n" not in str(caught.value)
+
+
+def test_a_shadow_that_is_less_sure_counts_less() -> None:
+    """Weights are those of least squares: one hundred times as unsure is as good as left out."""
+    given = sights(0.3, 0.0, 3)
+    without = bundle(beads(), given[1:], off(), CAMERA, 0.3)
+    moved = replace(given[0], pixel=(given[0].pixel[0] + 5, given[0].pixel[1]), spread=100.0)
+    kept = bundle(beads(), [moved, *given[1:]], off(), CAMERA, 0.3)
+    assert kept.used.all()
+    assert change(kept.poses).sub(change(without.poses)).abs().max() < 0.02
+    torch.testing.assert_close(kept.covariance, without.covariance, rtol=2e-3, atol=1e-6)
+    evenly = bundle(beads(), [replace(sight, spread=2.0) for sight in given], off(), CAMERA, 0.15)
+    torch.testing.assert_close(evenly.covariance, bundle(beads(), given, off(), CAMERA, 0.3).covariance)

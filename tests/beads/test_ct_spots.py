@@ -67,24 +67,26 @@ def test_centres_are_found_to_a_fraction_of_a_voxel(
     spacing: tuple[float, float, float], diameter_mm: float, worst_mm: float
 ) -> None:
     ct, points = scan(spacing, diameter_mm)
-    found = find_beads(ct, diameter_mm, len(points), None)
+    found, sure = find_beads(ct, diameter_mm, len(points), None)
     nearest = torch.cdist(points, found).min(1)
     assert sorted(nearest.indices.tolist()) == list(range(len(points)))
     assert nearest.values.max() < worst_mm
+    assert ((sure >= 0.01) & (sure < worst_mm)).all()
+    assert (nearest.values[nearest.indices.argsort()] < 6 * sure).all()
     assert (found[:-1, 2] > found[1:, 2]).all()  # from head to foot
 
 
 def test_a_turned_grid_gives_the_same_beads() -> None:
     ct, points = scan((1.0, 1.0, 1.0), 1.0, turned=True)
     assert rotation_angle(ct.lps_from_index[:3, :3]) > 0.2
-    assert torch.cdist(points, find_beads(ct, 1.0, len(points), None)).min(1).values.max() < 0.15
+    assert torch.cdist(points, find_beads(ct, 1.0, len(points), None)[0]).min(1).values.max() < 0.15
 
 
 def test_only_what_lies_within_is_searched() -> None:
     ct, points = scan((1.0, 1.0, 1.0), 1.0)
     within = torch.zeros(ct.data.shape, dtype=torch.bool)
     within[33:] = True  # above z = 33 mm
-    assert (find_beads(ct, 1.0, 3, within)[:, 2] > 33).all()
+    assert (find_beads(ct, 1.0, 3, within)[0][:, 2] > 33).all()
     with pytest.raises(InputError, match="3 beads of 1 mm found, 5 were expected"):
         find_beads(ct, 1.0, len(points), within)
 

@@ -24,6 +24,7 @@ from femoreg_torch.statistics.limit_tables import (
 )
 from femoreg_torch.statistics.quantities import POSES, QUANTITIES
 from femoreg_torch.statistics.study import study_tables
+from sim.study.limits_page import write_limits
 
 SETTINGS = made_up(1)["settings"].iloc[0]
 
@@ -91,3 +92,19 @@ def test_a_file_that_holds_no_bounds_is_refused(tmp_path: Path) -> None:
     pd.DataFrame({"number": [1]}).to_parquet(tmp_path / BOUNDS_NAME)
     with pytest.raises(InputError, match="has no column condition, settings"):
         read_bounds(tmp_path)
+
+
+def test_the_page_holds_the_tables_and_the_figure(tmp_path: Path) -> None:
+    (tmp_path / "limits.md").write_text("# Limits\n\nA head.\n\n## Measured\n\nold\n\n## Tests\n\nkept\n")
+    text = write_limits(made_up(2), made_up_bounds(), "the command", tmp_path, tmp_path)
+    page = (tmp_path / "limits.md").read_text(encoding="utf-8")
+    assert text in page
+    assert "old" not in page
+    assert page.index("## Measured") < page.index("## Tests\n\nkept")
+    for table in limit_tables(made_up(2), made_up_bounds()):
+        assert f"### {table.title}" in text
+        assert all(table.rows[0][column] in text for column in range(len(table.columns)))
+    assert (tmp_path / "limits.png").stat().st_size > 5000
+    other = made_up_bounds(condition="another")
+    with pytest.raises(InputError, match="no bounds of these runs"):
+        write_limits(made_up(2), other, "the command", tmp_path, tmp_path)

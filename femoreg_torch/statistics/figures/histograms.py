@@ -73,7 +73,8 @@ def _histogram(axes: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
     values = told(rows, quantity.column).dropna().to_numpy(float)
     if not len(values):
         return
-    end = reach(values)
+    end, paper = reach(values), quantity.paper.mean
+    end = max(end, 1.05 * paper if paper < 1.2 * end else 0.0)  # its line stands clear of the edge
     axes.hist(
         values,
         bins=_bins(len(values)),
@@ -83,8 +84,8 @@ def _histogram(axes: Axes, rows: pd.DataFrame, quantity: Quantity) -> None:
         alpha=0.6,
     )
     axes.axvline(values.mean(), color="black")
-    if quantity.paper.mean < end:
-        axes.axvline(quantity.paper.mean, color=PAPER, linestyle="--")
+    if paper < end:
+        axes.axvline(paper, color=PAPER, linestyle="--")
     axes.set_xlim(0, end)
 
 

@@ -1,5 +1,10 @@
 """Processes that die take nothing with them but the run that ends them; a Dask cluster gives the same rows."""
 
+import os
+import subprocess
+import sys
+import threading
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -9,6 +14,7 @@ from cheap_study import Cheap, study
 from joblib import delayed
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.files import read_json
 from sim.study.executors import OnCluster, OnThisMachine
 from sim.study.processes import in_processes
 from sim.study.rows import TABLE_NAME, comparable, read_table
@@ -52,3 +58,32 @@ def test_a_cluster_that_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr("sim.study.executors.PATIENCE", "1s")
     with pytest.raises(InputError, match=r"--scheduler tcp://127.0.0.1:9: does not answer"):
         run_study(study(1, Cheap()), tmp_path, OnCluster("tcp://127.0.0.1:9"))
+
+
+@pytest.mark.long
+def test_a_scheduler_that_goes_away_is_told_in_one_line_and_what_is_done_is_kept(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("distributed")
+    run_study(study(2, Cheap()), tmp_path / "out", OnThisMachine(1))
+    (tmp_path / "out" / TABLE_NAME).unlink()
+    known = tmp_path / "scheduler.json"
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
+    command += ["--scheduler-file", str(known)]
+    paths = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}  # it opens what it is sent
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, env=paths) as scheduler:
+        try:
+            for _ in range(300):
+                if known.is_file():
+                    break
+                time.sleep(0.1)
+            address = read_json(known)["address"]
+            stop = threading.Timer(2.0, scheduler.kill)
+            stop.start()
+            with pytest.raises(InputError, match=f"--scheduler {address}: has gone"):  # no worker ever comes
+                run_study(study(4, Cheap()), tmp_path / "out", OnCluster(address))
+            stop.join()
+        finally:
+            scheduler.kill()
+    assert len(rows(tmp_path / "out")) == 2
+    assert "Traceback" not in capfd.readouterr().err

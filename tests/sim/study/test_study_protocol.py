@@ -181,3 +181,10 @@ def test_the_page_on_studies_names_every_preset_and_its_examples_can_be_read(tmp
     settings_of(protocol, "varying")
     (tmp_path / "recorded.yaml").write_text(recorded, encoding="utf-8")
     assert load_protocol(tmp_path / "recorded.yaml").cases == ["recordings/*", "another/case"]
+
+
+def test_the_paper_preset_registers_the_same_procedures() -> None:
+    usual, slow = load_protocol("paper"), load_protocol("paper_preset")
+    assert slow.first(5, real=True) == usual.first(5, real=True)
+    assert (slow.vary, slow.simulation) == (usual.vary, usual.simulation)
+    assert (slow.preset, slow.procedures) == ("paper", 60)

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -44,16 +46,15 @@ def test_a_start_is_off_by_what_its_sweep_says(
 
 
 def test_success_needs_both_place_and_rotation() -> None:
-    def start(sweep: str, share: float, mm: float, deg: float) -> dict[str, object]:
-        return {"sweep": sweep, "share": share, "pelvis": {"mm": mm, "deg": deg}}
-
-    records = [
-        start("rotation", 0.0, 1, 0.1),
-        start("rotation", 0.2, 9.9, 1.9),
-        start("rotation", 0.2, 10.1, 0.1),
-        start("depth", 0.2, 0.1, 2.1),
+    starts = [
+        ("done", "rotation", 0.0, 1, 0.1),
+        ("done", "rotation", 0.2, 9.9, 1.9),
+        ("done", "rotation", 0.2, 10.1, 0.1),
+        ("done", "depth", 0.2, 0.1, 2.1),
+        ("failed", "depth", 0.2, np.nan, np.nan),
     ]
-    rates = success_rates(records)
+    rows = pd.DataFrame(starts, columns=["status", "varied_sweep", "varied_share", "pelvis_mm", "pelvis_deg"])
+    rates = success_rates(rows)
     assert rates["rotation"] == [(0.0, 1, 1), (pytest.approx(6.0), 1, 2)]
     assert rates["depth"] == [(0.0, 1, 1), (pytest.approx(20.0), 0, 1)]
     assert rates["jointly"] == [(0.0, 1, 1)]

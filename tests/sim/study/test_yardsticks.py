@@ -9,7 +9,10 @@ from cheap_study import Cheap, study
 from coarse import PROCEDURE, SIMULATION, stores_in
 
 from femoreg_torch.files import write_json
+from femoreg_torch.registration.plan import plan_from
+from femoreg_torch.statistics.rows import read_rows
 from sim.study import __main__ as command
+from sim.study.capture import plan_capture, success_rates, write_capture
 from sim.study.conditions import Imaged, body_of, made_once
 from sim.study.executors import OnThisMachine
 from sim.study.protocol import load_protocol
@@ -94,3 +97,34 @@ def test_bad_input_is_one_line_and_no_run_is_made(
     assert says in error
     assert error.count("\n") == 1
     assert not list(tmp_path.glob("*/runs/*"))
+
+
+def test_starts_at_the_truth_and_off_it_are_runs_of_a_study(coarse_root: Path, tmp_path: Path) -> None:
+    protocol = replace(load_protocol("accuracy"), simulation=str(coarse_root / SIMULATION))
+    (usual,) = settings_of(protocol, "accuracy").values()
+    stage = {
+        "name": "pelvis",
+        "kind": "stage",
+        "images": "first",
+        "kinds": ["anatomy"],
+        "render": ["pelvis"],
+        "bodies": [{"move": ["pelvis", "femur"], "rotation_deg": [3, 3, 3], "translation_mm": [4, 4, 20]}],
+        "level": {"pixel_mm": 6.2, "step_mm": 3.0},
+        "similarity": {"kind": "grad_ncc", "patch_radius": 2},
+        "optimiser": {"kind": "bobyqa", "max_evaluations": 16},
+    }
+    setting = replace(usual, plan=plan_from("short", {"steps": [stage]}))
+    stores, out = stores_in(coarse_root), tmp_path / "capture"
+    imaged = Imaged(None, tmp_path / "conditions")
+    plan = plan_capture(setting, [PROCEDURE], stores, imaged, starts=1)
+    assert run_study(plan, out, OnThisMachine(1)).status == {"done": 21}  # the truth, and five levels of four sweeps
+    rates = success_rates(read_rows(out / TABLE_NAME))
+    assert [[starts for _, _, starts in points] for points in rates.values()] == [[1] * 6] * 4
+    assert rates["depth"][0][1] == 1  # 16 evaluations do not lead far away from the truth
+    assert rates["jointly"][-1][1] == 0  # nor from 30°, 100 mm and 40 mm back to it
+    text = write_capture(read_rows(out / TABLE_NAME), setting.plan, out, tmp_path)
+    assert "on 1 simulated procedures" in text
+    assert (tmp_path / "capture_short.png").is_file()
+    counts: list[tuple[int, int, int]] = []
+    run_study(plan, out, OnThisMachine(1), begin=lambda *told: counts.append(told))
+    assert counts == [(0, 21, 0)]
