@@ -20,8 +20,8 @@ from femoreg_torch.intake.volumes import (
     cut_bones,
     described,
     fitting_tables,
+    header_warnings,
     looks_like_labels,
-    nifti_warnings,
 )
 from femoreg_torch.volume import (
     Volume,
@@ -135,7 +135,7 @@ def _dicom_file(path: Path) -> Findings:
 
 def _volume(path: Path, series: str | None = None) -> Findings:
     volume, told = read_volume_told(path, series)
-    warnings = [*told, *nifti_warnings(path)]
+    warnings = [*told, *header_warnings(path)]
     if looks_like_labels(volume):
         return _labels(volume, {}, path, warnings)
     low, high = (float(v) for v in volume.data.aminmax())

@@ -7,8 +7,8 @@ reflection in it, which no rigid pose holds. All matrices are float64, mm.
 - nanodrr 0.1.7 (`camera/extrinsics.py`, `camera/intrinsics.py`): `rt_inv` takes the stored picture's frame (x along
   columns, y along rows, z to the detector) to the RAS mm of the file; its pixel centres lie at + 0.5.
 - DiffDRR 0.6.1 (`detector.py`, `data.py`): a pose, after the reorientation that the subject brings, takes a frame with
-  x against columns (along them without `reverse_x_axis`), y against rows and z to the detector to RAS mm whose origin is
-  the middle of the volume, or that of the file if it was read with `center_volume=False`.
+  x against columns (along them without `reverse_x_axis`), y against rows and z to the detector to RAS mm whose origin
+  is the middle of the volume, or that of the file if it was read with `center_volume=False`.
 - xvr (`register/pose.py`, `register/logging.py`): the pose of DiffDRR as Euler angles ZXY in radians, and a translation
   that is turned by them; its files hold the matrix. Its pictures are without `reverse_x_axis` unless it is told
   otherwise, those of its versions before 2026 were with it: its files say which.
@@ -102,7 +102,7 @@ def to_diffdrr(
     """DiffDRR's pose (4, 4), as `RigidTransform` takes it.
 
     `middle_lps` (3,) is the middle of the CT's grid, or 0 if DiffDRR reads it with `center_volume=False`. `orientation`
-    is what `diffdrr.data.read` is given, `reverse_x_axis` what `diffdrr.drr.DRR` is given, both with DiffDRR's defaults.
+    is what `diffdrr.data.read` is given, `reverse_x_axis` what `diffdrr.drr.DRR` is given, with DiffDRR's defaults.
     "PA" shows mirror images of what the source sees, and so does `reverse_x_axis=False`; together they do not. Raises
     `InputError` where these do not fit `display`.
     """
