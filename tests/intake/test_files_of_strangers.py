@@ -173,6 +173,7 @@ def test_label_maps_of_floats_and_with_names_in_the_header(tmp_path: Path, plain
     assert torch.equal(
         read_label_map(tmp_path / "total.nii.gz").data, torch.from_numpy(multi.transpose(2, 1, 0).copy()).byte()
     )
+    assert any("femur_left" in fact for fact in inspect_path(tmp_path / "total.nii.gz").facts)
     nibabel.save(nibabel.Nifti1Image(values * 0.5, ras_affine()), tmp_path / "halves.nii.gz")
     with pytest.raises(InputError, match=r"whole numbers .* Export the segmentation as a label map"):
         read_label_map(tmp_path / "halves.nii.gz")

@@ -226,6 +226,9 @@ def test_headers_say_side_and_values_and_flags_may_say_otherwise(
     for n in (1, 2):
         detector_in_front = {"PositionerPrimaryAngle": 10 * n, **field}
         write_dicom_image(tmp_path / f"images/run{n}", n, 2, PixelIntensityRelationship="LIN", **detector_in_front)
+    found = inspect_path(tmp_path / "images" / "run1")
+    assert any("the patient's posterior side" in fact for fact in found.facts)
+    assert any("shown: the first frame" in fact for fact in found.facts)
     assert "holds 2 frames, one was expected" in made("cine")
     assert "the patient's posterior side, by the header of run1" in made("behind", frames="mean")
     case = read_case(tmp_path / "behind")
@@ -242,6 +245,7 @@ def test_headers_say_side_and_values_and_flags_may_say_otherwise(
     assert "holds intensities (raw) by its PixelInt" in made("logs", frames=1, intensity="log")
     for n in (1, 2):
         write_dicom_image(tmp_path / f"images/run{n}", n, Modality="DX")
+    assert any("does not say what its values are" in one for one in inspect_path(tmp_path / "images/run1").warnings)
     assert "does not say what its values are" in made("radiographs")
     assert "Case written" in made("said", intensity="raw")
 
