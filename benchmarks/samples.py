@@ -44,6 +44,7 @@ def samples(volume: BrickedVolume, affines: cpu.Array, camera: Camera, offsets: 
 
 def samples_of_a_registration(case: Path) -> dict[str, int]:
     """Samples of `femoreg register` by what it reports, in a process that is used for nothing else."""
+    from femoreg_torch.case import read_case
     from femoreg_torch.commands.register import register_into
 
     found: Counter[str] = Counter()
@@ -62,5 +63,5 @@ def samples_of_a_registration(case: Path) -> dict[str, int]:
 
     cpu.projection, cpu.projection_with_moments = counting(cpu.projection), counting(cpu.projection_with_moments)
     with tempfile.TemporaryDirectory() as folder:
-        register_into(Path(folder) / "run", case, "fast", 0, report=report)
+        register_into(Path(folder) / "run", read_case(case), "fast", 0, report=report)
     return dict(found)

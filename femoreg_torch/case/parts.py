@@ -171,18 +171,20 @@ def read_grid(view: Fields, folder: Path) -> GridImage | None:
 
 
 def read_display(fields: Fields) -> Display:
-    """How images are stored, under `display`: `{source, mirrored, turned}`; what is left out is as usual."""
+    """How images are stored, under `display`: `{source, mirrored, turned, ignore_header}`; else as usual."""
     if "display" not in fields:
         return Display()
-    display = fields.mapping("display").only("source", "mirrored", "turned")
+    display = fields.mapping("display").only("source", "mirrored", "turned", "ignore_header")
     source = cast(Source, display.choice("source", SOURCES)) if "source" in display else "anterior"
-    mirrored, turned = display.content.get("mirrored", False), display.content.get("turned", 0)
-    if not isinstance(mirrored, bool):
-        raise InputError(f"{display.where('mirrored')}: true or false was expected, found {mirrored!r}.")
+    turned = display.content.get("turned", 0)
+    flags = {key: display.content.get(key, False) for key in ("mirrored", "ignore_header")}
+    for key, flag in flags.items():
+        if not isinstance(flag, bool):
+            raise InputError(f"{display.where(key)}: true or false was expected, found {flag!r}.")
     if isinstance(turned, bool) or turned not in TURNS:
         known = ", ".join(map(str, TURNS))
         raise InputError(f"{display.where('turned')}: degrees clockwise, {known}, were expected, found {turned!r}.")
-    return Display(source, mirrored, turned)
+    return Display(source, flags["mirrored"], turned, flags["ignore_header"])
 
 
 def read_frames(view: Fields) -> Frames | None:

@@ -46,7 +46,7 @@ def write_case(folder: Path, case: Case, standing: Path | None = None) -> None:
         if case.plan is not None:
             content["plan"] = _plan(case.plan, base)
     content["carm"] = _carm(replace(case.carm, camera=case.display.stored_camera(case.carm.camera)))
-    content |= _display(case.display)
+    content |= display_content(case.display)
     if case.views:
         content["views"] = [_view(view, base, case.template is not None) for view in case.views]
     if case.truth is not None:
@@ -163,16 +163,17 @@ def _view(view: View, folder: Path, short: bool) -> dict[str, Any]:
     frames: Any = {} if view.frames is None else {"frames": view.frames}
     if isinstance(view.frames, tuple) and len(view.frames) == 1:
         frames = {"frames": view.frames[0]}
-    display = {} if view.display is None else _display(view.display, whole=True)
+    display = {} if view.display is None else display_content(view.display, whole=True)
     grid = {} if view.grid is None else {"image": _relative(view.grid.path, folder), "pitch_mm": view.grid.pitch_mm}
     return content | said | pose | _field(view, folder) | frames | display | ({"grid": grid} if grid else {})
 
 
-def _display(display: Display, whole: bool = False) -> dict[str, Any]:
-    """Nothing for the usual display, unless the `whole` is asked for."""
-    if display == Display() and not whole:
+def display_content(display: Display, whole: bool = False) -> dict[str, Any]:
+    """The key `display` of `case.yaml`; nothing for the usual display, unless the `whole` is asked for."""
+    if display == Display() and not display.ignore_header and not whole:
         return {}
-    return {"display": {"source": display.source, "mirrored": display.mirrored, "turned": display.turned_deg}}
+    told = {"source": display.source, "mirrored": display.mirrored, "turned": display.turned_deg}
+    return {"display": told | ({"ignore_header": True} if display.ignore_header else {})}
 
 
 def _field(view: View, folder: Path) -> dict[str, Any]:

@@ -192,6 +192,7 @@ def run_job(job: Job) -> Row:
     import numba
     import torch
 
+    from femoreg_torch.case import read_case
     from femoreg_torch.commands.register import register_into
     from femoreg_torch.errors import InputError, defect_in_one_line
 
@@ -200,7 +201,8 @@ def run_job(job: Job) -> Row:
     began = time.perf_counter()
     try:
         device = torch.device(job.device)
-        result, _ = register_into(job.out, job.case, job.preset, job.seed, weights=job.weights, device=device)
+        case = read_case(job.case)
+        result, _ = register_into(job.out, case, job.preset, job.seed, weights=job.weights, device=device)
     except (InputError, OSError) as error:
         return _bad(job, "refused", " ".join(str(error).split()), time.perf_counter() - began)
     except Exception as error:  # a defect: told with its place, and the other cases go on

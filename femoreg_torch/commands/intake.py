@@ -109,7 +109,12 @@ def new_case(
     images: tuple[Path, ...] = (),
     device_images: tuple[Path, ...] = (),
     carm: str | None = None,
-    intensity: Literal["raw", "log"] = "raw",
+    intensity: Literal["raw", "log"] | None = None,
+    frames: int | Literal["mean"] | None = None,
+    source: Literal["anterior", "posterior", "left", "right"] | None = None,
+    mirrored: bool = False,
+    turned: Literal[0, 90, 180, 270] = 0,
+    ignore_header: bool = False,
 ) -> None:
     """Make a case folder of a CT, a segmentation, landmarks, a plan, a device and fluoroscopic images.
 
@@ -141,7 +146,13 @@ def new_case(
         images: Images without the device, one for each C-arm pose, in order; or a folder of them.
         device_images: Images with the device, in the same order; or a folder of them.
         carm: C-arm: a preset (cios_fusion) or a YAML file; by default what the tags of the first DICOM image say.
-        intensity: raw (bone dark) or log (attenuation, bone bright).
+        intensity: raw (bone dark) or log (attenuation, bone bright); by default what the files say, or else raw.
+        frames: Of cine runs, a frame's number from 1, or `mean` of all.
+        source: Side of the patient that the X-ray source stands on; by default what the header of the first image says,
+            or else anterior.
+        mirrored: The pictures are mirror images of the usual ones, which have the patient's left on their right.
+        turned: Degrees by which the pictures are turned clockwise against head up.
+        ignore_header: What DICOM headers say of the side of the source and of the pictures' orientation means nothing.
     """
     import sys
 
@@ -172,6 +183,11 @@ def new_case(
         device_images=tuple(device_images),
         carm=carm,
         intensity=intensity,
+        frames=frames,
+        source=source,
+        mirrored=mirrored,
+        turned=turned,
+        ignore_header=ignore_header,
     )
     console = Console(soft_wrap=True)
     if sys.stdin.isatty():

@@ -65,11 +65,12 @@ def register(
 
     console = Console()
     place = tell_device(console, device)
-    response = response_of(read_case(case))
+    read = read_case(case)
+    response = response_of(read)
     with progress_report(console, "reading the case") as report:
         result, navigation = register_into(
             out,
-            case,
+            read,
             preset,
             seed,
             weights=weights,
@@ -91,7 +92,7 @@ def register(
 
 def register_into(
     out: Path,
-    folder: Path,
+    case: "Case",
     preset: str,
     seed: int,
     *,
@@ -102,7 +103,7 @@ def register_into(
     device: "torch.device | None" = None,
     report: "Report | None" = None,
 ) -> "tuple[Result, dict[str, Any] | None]":
-    """Register the case in a folder and write all that belongs to its run into `out`; see `register`.
+    """Register a case and write all that belongs to its run into `out`; see `register`.
 
     Without a `device`, it computes on the CPU.
 
@@ -111,7 +112,7 @@ def register_into(
     import os
     from dataclasses import replace
 
-    from femoreg_torch.case import RESULT_NAME, new_folder, read_case, result_content, write_json
+    from femoreg_torch.case import RESULT_NAME, new_folder, result_content, write_json
     from femoreg_torch.case.review import REVIEW_NAME
     from femoreg_torch.case.start_files import read_pixels, read_start_poses
     from femoreg_torch.drr import CPU
@@ -122,11 +123,12 @@ def register_into(
     from femoreg_torch.registration.run import network_detector, register_scene, silent
 
     check_new_folder(out)
-    case = read_case(folder)
     tool = None if case.plan is None else case.plan.tool
     calibration = None if robot is None or tool is None else read_robot(robot, tool)
     if robot is not None and (tool is None or not _is_seen(case, tool)):
-        raise InputError(f"{folder}: --robot was given, but there is no tool to steer, or no view has an image of it.")
+        raise InputError(
+            f"{case.folder}: --robot was given, but there is no tool to steer, or no view has an image of it."
+        )
     result, scene = register_scene(
         case,
         None,
@@ -139,7 +141,7 @@ def register_into(
         report=report or silent,
     )
     result = replace(
-        result, errors=evaluate(case, result, scene), case=os.path.relpath(folder.resolve(), out.resolve())
+        result, errors=evaluate(case, result, scene), case=os.path.relpath(case.folder.resolve(), out.resolve())
     )
     navigation = None if result.object_from_tool is None else navigation_content(result, calibration)
     with new_folder(out, without=(*EVALUATION_NAMES, *NAVIGATION_NAMES, *REPLAY_NAMES, REVIEW_NAME)) as built:

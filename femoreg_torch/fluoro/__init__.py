@@ -1,7 +1,7 @@
 """Fluoroscopic images: files, display, the exposed field, attenuation, distortion and coarser grids."""
 
 from femoreg_torch.fluoro.collimation import Shutter, exposed_field, find_shutter, without_penumbra
-from femoreg_torch.fluoro.dicom import Frames, carm_settings
+from femoreg_torch.fluoro.dicom import Frames, carm_settings, read_header
 from femoreg_torch.fluoro.display import SOURCES, TURNS, Display, Source
 from femoreg_torch.fluoro.distortion import Distortion, GridImage, find_distortion, find_grid_spots
 from femoreg_torch.fluoro.field import Circle, Polygon
@@ -14,7 +14,7 @@ from femoreg_torch.fluoro.reading import (
     settled_intensity,
     write_image,
 )
-from femoreg_torch.fluoro.tags import Tags, contradictions, side_remarks
+from femoreg_torch.fluoro.tags import Tags, check_header, contradictions, nearest_side
 
 __all__ = [
     "SOURCES",
@@ -32,6 +32,7 @@ __all__ = [
     "attenuation_image",
     "binned",
     "carm_settings",
+    "check_header",
     "check_matches",
     "contradictions",
     "downsample",
@@ -39,10 +40,11 @@ __all__ = [
     "find_distortion",
     "find_grid_spots",
     "find_shutter",
+    "nearest_side",
+    "read_header",
     "read_image",
     "read_stored",
     "settled_intensity",
-    "side_remarks",
     "without_penumbra",
     "write_image",
 ]

@@ -3,20 +3,27 @@
 Windows (VOI LUT) and presentation LUTs are for looking: they cut grey values off and bend them, and are not applied.
 """
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import SimpleITK as sitk
 from numpy.typing import NDArray
 
 from femoreg_torch.arrays import check_pixels, quiet
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro.tags import Tags, read_tags
+from femoreg_torch.fluoro.tags import Tags, find_value, read_tags
 
 Frames = tuple[int, ...] | Literal["mean"]  # of a cine run: numbers from 1, averaged, or all of them
 Values = NDArray[Any]
+_PIXEL_TAGS = (
+    "SOPClassUID", "SOPInstanceUID", "Modality", "NumberOfFrames", "SamplesPerPixel", "PhotometricInterpretation",
+    "PlanarConfiguration", "Rows", "Columns", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
+    "PixelData",
+)  # fmt: skip
 _RADIOGRAPHS = ("CR", "DX")  # which are shown with bone bright, where fluoroscopy has it dark
 
 
@@ -37,7 +44,7 @@ def carm_settings(path: Path) -> dict[str, Any]:
 
     Raises `InputError` that names the tags that are missing.
     """
-    tags = _tags(_dataset(path, stop_before_pixels=True), path)
+    tags = read_header(path)
     told = {"sdd_mm": tags.sdd_mm, "pixel_mm": tags.pixel_mm, "shape": tags.shape}
     names = {"sdd_mm": "DistanceSourceToDetector", "pixel_mm": "ImagerPixelSpacing", "shape": "Rows, Columns"}
     if missing := [key for key, value in told.items() if value is None]:
@@ -49,6 +56,11 @@ def carm_settings(path: Path) -> dict[str, Any]:
     if tags.principal_point_px is not None:
         found["principal_point_px"] = list(tags.principal_point_px)
     return found
+
+
+def read_header(path: Path) -> Tags:
+    """What the header of a DICOM image says. Raises `InputError`."""
+    return _tags(_dataset(path, stop_before_pixels=True), path)
 
 
 def _dataset(path: Path, **options: Any) -> Any:
@@ -96,9 +108,9 @@ def _read(path: Path, frames: Frames | None) -> DicomImage:
             return DicomImage(stored, tags, None, None, (), None)  # refused by its shape
         stored = stored[..., 0]
     padding = _padding(dataset, stored)
-    relation = str(dataset.get("PixelIntensityRelationship") or "")
+    relation = str(find_value(dataset, "PixelIntensityRelationship") or "")
     values, lowest, highest, linear = _after_modality(dataset, stored, relation)
-    sign = dataset.get("PixelIntensityRelationshipSign")
+    sign = find_value(dataset, "PixelIntensityRelationshipSign")
     inverted = sign == -1 if sign is not None else dataset.get("PhotometricInterpretation") == "MONOCHROME1"
     if inverted and not linear:  # a LUT to linear values says itself which are high
         values = lowest + highest - values
@@ -143,10 +155,35 @@ def _pixels(dataset: Any, frames: tuple[int, ...]) -> Values:
     """Stored values (H, W), or (H, W, 3); the mean, float64, of several frames."""
     from pydicom.pixels import pixel_array
 
-    packed = dataset.file_meta.TransferSyntaxUID.is_compressed
-    read = [pixel_array(dataset, index=n, correct_unused_bits=packed) for n in frames]
-    read = read if packed else [_stored_bits(dataset, pixels) for pixels in read]
+    if not dataset.file_meta.TransferSyntaxUID.is_compressed:
+        read = [_stored_bits(dataset, pixel_array(dataset, index=n, correct_unused_bits=False)) for n in frames]
+    else:
+        try:
+            read = [pixel_array(dataset, index=n) for n in frames]
+        except (NotImplementedError, RuntimeError):  # a compression that pydicom has no decoder for, as lossless JPEG
+            everything = _by_gdcm(dataset)
+            read = [everything[n] for n in frames]
     return read[0] if len(read) == 1 else np.mean(read, axis=0)
+
+
+def _by_gdcm(dataset: Any) -> Values:
+    """Stored values (F, H, W) of a compressed image by GDCM, in SimpleITK, which knows all kinds of JPEG.
+
+    It applies what it finds of rescaling, so it is given the pixels and what describes them alone. Raises
+    `RuntimeError` for what it cannot decode either.
+    """
+    from pydicom.dataset import Dataset
+
+    bare = Dataset()
+    bare.file_meta = dataset.file_meta
+    for keyword in _PIXEL_TAGS:
+        if keyword in dataset:
+            bare.add(dataset[keyword])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "image.dcm"
+        bare.save_as(path, enforce_file_format=True)
+        values = sitk.GetArrayFromImage(sitk.ReadImage(str(path), imageIO="GDCMImageIO"))
+    return values if values.ndim > 2 else values[None]
 
 
 def _stored_bits(dataset: Any, pixels: Values) -> Values:
@@ -184,7 +221,10 @@ def _after_modality(dataset: Any, stored: Values, relation: str) -> tuple[Values
     bits = int(dataset.get("BitsStored", 16))
     lowest = -(2 ** (bits - 1)) if dataset.get("PixelRepresentation") else 0
     ends = np.array([lowest, lowest + 2**bits - 1])
-    for item in dataset.get("PixelIntensityRelationshipLUTSequence") or ():
+    for keyword in ("RescaleSlope", "RescaleIntercept"):  # of enhanced images
+        if keyword not in dataset and (value := find_value(dataset, keyword)) is not None:
+            setattr(dataset, keyword, value)
+    for item in find_value(dataset, "PixelIntensityRelationshipLUTSequence") or ():
         if item.get("LUTFunction") == "TO_LINEAR":
             dataset.ModalityLUTSequence = [item]  # in place of what the file has for display
     has_table = bool(dataset.get("ModalityLUTSequence"))

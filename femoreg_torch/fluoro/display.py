@@ -5,7 +5,7 @@ thing: a C-arm whose source stands behind the patient shows the patient's left o
 image of what its source sees. Pixels are (column, row), centre of the first one at (0, 0).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import torch
@@ -36,6 +36,7 @@ class Display:
     source: Source = "anterior"  # the side of the patient that the source stands on
     mirrored: bool = False  # against the usual picture
     turned_deg: int = 0  # clockwise, against head up, after it was mirrored
+    ignore_header: bool = field(default=False, compare=False)  # what a DICOM header says of all this means nothing
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES or self.turned_deg not in TURNS:

@@ -78,11 +78,11 @@ def read_tags(dataset: Any) -> Tags:
         source_deg=_source(dataset),
         orientation=_orientation(dataset),
         field=_shutter(dataset, "Shutter") or _shutter(dataset, "Collimator"),
-        flipped={"YES": True, "NO": False}.get(str(_find(dataset, "FieldOfViewHorizontalFlip"))),
+        flipped={"YES": True, "NO": False}.get(str(find_value(dataset, "FieldOfViewHorizontalFlip"))),
     )
 
 
-def _find(dataset: Any, keyword: str) -> Any:
+def find_value(dataset: Any, keyword: str) -> Any:
     """A value at the top, or, in an enhanced image, in a group that all frames share or of the first frame."""
     value = dataset.get(keyword)
     if value is not None:
@@ -90,6 +90,8 @@ def _find(dataset: Any, keyword: str) -> Any:
     for groups in ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence"):
         for item in (dataset.get(groups) or [])[:1]:
             for element in item:
+                if element.keyword == keyword:
+                    return element.value
                 for inner in element.value if element.VR == "SQ" else ():
                     if inner.get(keyword) is not None:
                         return inner.get(keyword)
@@ -98,7 +100,7 @@ def _find(dataset: Any, keyword: str) -> Any:
 
 def _numbers(dataset: Any, keyword: str, count: int) -> list[float] | None:
     """So many finite numbers, or None where the tag is absent or empty."""
-    value = _find(dataset, keyword)
+    value = find_value(dataset, keyword)
     if value is None or value == "":
         return None
     try:
@@ -114,7 +116,7 @@ def _source(dataset: Any) -> float | None:
     """Where the source stands about the patient, degrees: from the positioner's angle, or from the view's name."""
     primary = _numbers(dataset, "PositionerPrimaryAngle", 1) or _numbers(dataset, "PositionerIsocenterPrimaryAngle", 1)
     if primary is None:
-        return _VIEWS.get(str(_find(dataset, "ViewPosition")))
+        return _VIEWS.get(str(find_value(dataset, "ViewPosition")))
     return primary[0] + 180  # opposite to the detector
 
 
@@ -139,7 +141,7 @@ def _middle_of_detector(
     if origin is None or element is None or active is None or shape is None or pixel is None:
         return None
     quarters = round((_numbers(dataset, "FieldOfViewRotation", 1) or [0.0])[0] / 90) % 4
-    mirrored = _find(dataset, "FieldOfViewHorizontalFlip") == "YES"
+    mirrored = find_value(dataset, "FieldOfViewHorizontalFlip") == "YES"
     extent = [n * mm for n, mm in zip(shape, pixel, strict=True)]  # of the field, mm: rows, columns
     on_detector = extent[::-1] if quarters % 2 else extent
     down, right = (
@@ -185,19 +187,18 @@ def contradictions(tags: Tags, camera: Camera, display: Display, uncertainty: Un
     """Where a header contradicts what a case says of its pictures: their camera and display. In words; empty: nowhere.
 
     Lengths contradict where they differ by more than 1 %, or than three of the deviations that the C-arm's file tells.
-    The side of the source contradicts nothing where the display is the usual one: see `side_remarks`.
+    Side and orientation are not looked at where the display says that the header's mean nothing.
     """
-    side = [] if display == Display() else _other_side(tags, display)
-    return [*_other_camera(tags, camera, uncertainty), *side, *_other_orientation(tags, display)]
+    shown = [] if display.ignore_header else [*_other_side(tags, display), *_other_orientation(tags, display)]
+    return [*_other_camera(tags, camera, uncertainty), *shown]
 
 
-def side_remarks(tags: Tags, display: Display) -> list[str]:
-    """Where a header puts the source, if not where a case has it that says nothing of its display.
-
-    Many a simulator, and many a phantom on a table, has angles that mean nothing; and what is on the wrong side is
-    found out by the registration's own checks.
-    """
-    return list(_other_side(tags, display)) if display == Display() else []
+def check_header(
+    tags: Tags | None, camera: Camera, display: Display, uncertainty: Uncertainty | None, where: str
+) -> None:
+    """Raises `InputError` that starts with `where` and tells all `contradictions`; nothing without a header."""
+    if tags is not None and (wrong := contradictions(tags, camera, display, uncertainty)):
+        raise InputError(f"{where}, {'; '.join(wrong)}.")
 
 
 def _other_camera(tags: Tags, camera: Camera, uncertainty: Uncertainty | None) -> Iterator[str]:
@@ -228,10 +229,11 @@ def _other_camera(tags: Tags, camera: Camera, uncertainty: Uncertainty | None) -
 
 def _other_side(tags: Tags, display: Display) -> Iterator[str]:
     if tags.source_deg is not None and _apart(tags.source_deg, _SIDES[display.source]) > _NEAR_DEG:
-        side = min(_SIDES, key=lambda name: _apart(tags.source_deg or 0.0, _SIDES[name]))
+        side = nearest_side(tags.source_deg)
+        has = "takes it for anterior, as nothing is said" if display == Display() else f"says {display.source}"
         yield (
-            f"PositionerPrimaryAngle or ViewPosition put the source on the patient's {side} side, but the case says "
-            f"{display.source}. Write `display: {{source: {side}}}`"
+            f"PositionerPrimaryAngle or ViewPosition put the source on the patient's {side} side, but the case {has}. "
+            f"Write `display: {{source: {side}}}`{_unless(display)}"
         )
 
 
@@ -241,8 +243,20 @@ def _other_orientation(tags: Tags, display: Display) -> Iterator[str]:
         yield (
             f"PatientOrientation {tags.orientation[0]}, {tags.orientation[1]} does not fit the display of the case. "
             f"Write `display: {{source: {told.source}, mirrored: {str(told.mirrored).lower()}, "
-            f"turned: {told.turned_deg}}}`"
+            f"turned: {told.turned_deg}}}`{_unless(display)}"
         )
+
+
+def _unless(display: Display) -> str:
+    """What to write if the header is wrong."""
+    said = {"source": display.source, "mirrored": display.mirrored, "turned": display.turned_deg}
+    words = [f"{key}: {str(value).lower()}" for key, value in said.items() if key == "source" or value]
+    return f", or, if the header's value means nothing, `display: {{{', '.join(words)}, ignore_header: true}}`"
+
+
+def nearest_side(source_deg: float) -> Source:
+    """The side of the patient that a source stands on, by its angle from the front to the patient's left."""
+    return min(_SIDES, key=lambda name: _apart(source_deg, _SIDES[name]))
 
 
 def _apart(a_deg: float, b_deg: float) -> float:

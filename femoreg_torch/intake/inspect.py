@@ -12,7 +12,7 @@ from torch import Tensor
 from femoreg_torch.anatomy import HIP, bone_of_name
 from femoreg_torch.case import read_case
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import read_image
+from femoreg_torch.fluoro import Frames, nearest_side, read_stored
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import (
@@ -20,8 +20,8 @@ from femoreg_torch.intake.volumes import (
     cut_bones,
     described,
     fitting_tables,
+    header_warnings,
     looks_like_labels,
-    nifti_warnings,
 )
 from femoreg_torch.volume import (
     Volume,
@@ -129,15 +129,19 @@ def _dicom_file(path: Path) -> Findings:
         ("NumberOfFrames", "frames"),
     ):
         words.append(f"{told}: {header[tag].value}" if tag in header else f"{told}: not told")
-    found = _image(path)
+    several = int(header.get("NumberOfFrames") or 1) > 1
+    found = _image(path, (1,) if several else None)
+    if several:
+        words.append("shown: the first frame; a case says which are meant, as `frames: 1` or `frames: mean`")
     return Findings("DICOM image", (*found.facts, *words), found.warnings, found.picture)
 
 
 def _volume(path: Path, series: str | None = None) -> Findings:
     volume, told = read_volume_told(path, series)
-    warnings = [*told, *nifti_warnings(path)]
+    warnings = [*told, *header_warnings(path)]
     if looks_like_labels(volume):
-        return _labels(volume, {}, path, warnings)
+        named = path.is_file() and not is_dicom(path) and has_names(path)
+        return _labels(volume, segment_names(path) if named else {}, path, warnings)
     low, high = (float(v) for v in volume.data.aminmax())
     facts = (described(volume), f"values from {low:g} to {high:g}")
     return Findings("CT", facts, (*warnings, *ct_warnings(volume)), three_planes(volume, None, {}, {}))
@@ -221,11 +225,14 @@ def _transform(path: Path) -> Findings:
     return Findings("rigid transform of ITK or 3D Slicer", (said, *rows))
 
 
-def _image(path: Path) -> Findings:
-    image = read_image(path)
+def _image(path: Path, frames: Frames | None = None) -> Findings:
+    stored = read_stored(path, frames)
+    image = stored.values
     low, high = (float(v) for v in image.aminmax())
-    facts = (f"{image.shape[1]} × {image.shape[0]} pixels, values from {low:g} to {high:g}",)
-    warnings = []
+    facts = [f"{image.shape[1]} × {image.shape[0]} pixels, values from {low:g} to {high:g}"]
+    if stored.tags is not None and stored.tags.source_deg is not None:
+        facts.append(f"the source stands on the patient's {nearest_side(stored.tags.source_deg)} side, by the header")
+    warnings = [*stored.remarks, *([stored.asks] if stored.asks else [])]
     if len(image.unique()) <= 256:
         warnings.append(
             "at most 256 grey values: a picture made for a screen, whose logarithm may not be a line integral"
@@ -233,7 +240,7 @@ def _image(path: Path) -> Findings:
     grey = ((image - low) / max(high - low, 1e-9) * 255).numpy().astype(np.uint8)
     shrink = min(1.0, 768 / max(grey.shape))
     picture = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-    return Findings("image", facts, tuple(warnings), np.repeat(picture[..., None], 3, 2))
+    return Findings("image", tuple(facts), tuple(warnings), np.repeat(picture[..., None], 3, 2))
 
 
 def _case(path: Path) -> Findings:

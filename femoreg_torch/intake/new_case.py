@@ -3,7 +3,7 @@
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import torch
 import yaml
@@ -14,8 +14,10 @@ from femoreg_torch.case.femoroplasty import DEVICE, DEVICE_POINTS, FEMUR, TEMPLA
 from femoreg_torch.case.model import Intensity, Side
 from femoreg_torch.case.nominal import ALONG_PATH, NominalPlace
 from femoreg_torch.case.reading import VERSIONS
+from femoreg_torch.case.writing import display_content
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import new_folder, plain, write_text
+from femoreg_torch.fluoro import Display, Source, carm_settings, nearest_side, read_header
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.check import check_case
 from femoreg_torch.intake.volumes import fitting_tables
@@ -65,7 +67,12 @@ class NewCase:
     images: tuple[Path, ...] = ()
     device_images: tuple[Path, ...] = ()
     carm: str | None = None
-    intensity: Intensity = "raw"
+    intensity: Intensity | None = None
+    frames: int | Literal["mean"] | None = None
+    source: Source | None = None
+    mirrored: bool = False
+    turned: int = 0
+    ignore_header: bool = False
 
 
 def make_case(out: Path, given: NewCase) -> list[str]:
@@ -150,7 +157,8 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
         content[DEVICE] = _device(folder, given, notes)
     images, device_images = _files(given.images), _files(given.device_images)
     content["carm"] = _carm(folder, given, images[0], notes)
-    content["views"] = _views(folder, images, device_images, given.intensity, notes)
+    content |= _display(given, images, notes)
+    content["views"] = _views(folder, images, device_images, given, notes)
     return content
 
 
@@ -274,19 +282,20 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
 
 
 def _views(
-    folder: Path, images: list[Path], device_images: list[Path], intensity: Intensity, notes: list[str]
+    folder: Path, images: list[Path], device_images: list[Path], given: NewCase, notes: list[str]
 ) -> list[dict[str, Any]]:
     if device_images and len(device_images) != len(images):
         raise InputError(
             f"--device-images: {len(device_images)} files, but there are {len(images)} images without the device. Give "
             "one of each for every C-arm pose, in the same order."
         )
+    said = {"intensity": given.intensity, "frames": given.frames}
     views: list[dict[str, Any]] = []
     for number, path in enumerate(images, 1):
         view: dict[str, Any] = {"anatomy": _copied(path, folder, f"view{number}")}
         if device_images:
             view[DEVICE] = _copied(device_images[number - 1], folder, f"view{number}_device")
-        views.append(view | {"intensity": intensity})
+        views.append(view | {key: value for key, value in said.items() if value is not None})
     beside = [f", with the device {_short(path)}" for path in device_images] or [""] * len(images)
     notes += [f"view {n} is {_short(path)}{more}" for n, (path, more) in enumerate(zip(images, beside, strict=True), 1)]
     return views
@@ -307,20 +316,27 @@ def _carm(folder: Path, given: NewCase, image: Path, notes: list[str]) -> str | 
         return given.carm
     if not is_dicom(image):
         raise InputError(f"--carm: is missing, and {image.name} is no DICOM file whose tags could say it.")
-    import pydicom
-
-    header = pydicom.dcmread(image, stop_before_pixels=True, force=True)
-    tags = ("DistanceSourceToDetector", "ImagerPixelSpacing", "Rows", "Columns")
-    if missing := [tag for tag in tags if header.get(tag) in (None, "")]:
+    try:
+        carm = carm_settings(image)
+    except InputError as error:
         raise InputError(
-            f"--carm: is missing, and {image.name} has no {' and no '.join(missing)}. Give a C-arm's YAML file: "
-            "{sdd_mm, pixel_mm: [row, column], shape: [rows, columns]}."
-        )
-    carm = {
-        "sdd_mm": float(header.DistanceSourceToDetector),
-        "pixel_mm": [float(v) for v in header.ImagerPixelSpacing],
-        "shape": [int(header.Rows), int(header.Columns)],
-    }
-    told = f"source to detector {carm['sdd_mm']:g} mm, pixels of {carm['pixel_mm'][0]:g} mm"  # type: ignore[index]
-    notes.append(f"the C-arm is that of the tags of {image.name}: {told}")
+            f"--carm: is missing. {error} A YAML file with these can be given: --carm my_carm.yaml."
+        ) from error
+    told = f"source to detector {carm['sdd_mm']:g} mm, pixels of {carm['pixel_mm'][0]:g} mm"
+    notes.append(f"the C-arm is that of the tags of {image.name}: {told}. It should be calibrated")
     return carm
+
+
+def _display(given: NewCase, images: list[Path], notes: list[str]) -> dict[str, Any]:
+    """How pictures are stored: as the flags say, or else the side that the header of the first image puts the source.
+
+    What other images say is held against it when the case is checked.
+    """
+    source, tags = given.source, read_header(images[0]) if is_dicom(images[0]) else None
+    if source is None and not given.ignore_header and tags is not None and tags.source_deg is not None:
+        source = nearest_side(tags.source_deg)
+        notes.append(f"the source stands on the patient's {source} side, by the header of {images[0].name}")
+    display = Display(source or "anterior", given.mirrored, given.turned, given.ignore_header)
+    if source is None and tags is None:
+        notes.append("the source is taken to stand in front of the patient, as no --source was given")
+    return display_content(display)

@@ -1,5 +1,6 @@
 """What is worth knowing, and worth a warning, of a CT and of a label map."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ _LEAST_AIR = 0.005  # share of the voxels; beside every patient there is some
 _METAL_ML = 1.0
 _FACES = ("right", "left", "front", "back", "lower", "upper")  # low and high end of x, y, z
 _DISAGREE_MM = 0.5
+_NRRD_HEADER = 2**16  # bytes that hold it
 
 
 def described(volume: Volume) -> str:
@@ -98,8 +100,14 @@ def fitting_tables(ids: Sequence[int]) -> list[str]:
     ]
 
 
-def nifti_warnings(path: Path) -> list[str]:
-    """In words, where the header of a NIfTI file leaves open where the patient's left is, or contradicts itself."""
+def header_warnings(path: Path) -> list[str]:
+    """In words, where a NIfTI or NRRD header leaves open where the patient's left is, or contradicts itself."""
+    if path.name.lower().endswith((".nrrd", ".nhdr")):
+        with path.open("rb") as file:
+            header = file.read(_NRRD_HEADER).partition(b"\n\n")[0]
+        if re.search(rb"^space:", header, re.MULTILINE):
+            return []
+        return ["the NRRD header names no `space`: its axes are assumed to run to the left, back and head"]
     if not path.name.lower().endswith((".nii", ".nii.gz")):
         return []
     image: Any = nibabel.load(path)  # its declared type is that of all formats

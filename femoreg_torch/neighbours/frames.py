@@ -7,8 +7,11 @@ reflection in it, which no rigid pose holds. All matrices are float64, mm.
 - nanodrr 0.1.7 (`camera/extrinsics.py`, `camera/intrinsics.py`): `rt_inv` takes the stored picture's frame (x along
   columns, y along rows, z to the detector) to the RAS mm of the file; its pixel centres lie at + 0.5.
 - DiffDRR 0.6.1 (`detector.py`, `data.py`): a pose, after the reorientation that the subject brings, takes a frame with
-  x against columns, y against rows and z to the detector to RAS mm whose origin is the middle of the volume.
-- xvr: the pose of DiffDRR as Euler angles ZXY in radians, and a translation that is turned by them.
+  x against columns (along them without `reverse_x_axis`), y against rows and z to the detector to RAS mm whose origin
+  is the middle of the volume, or that of the file if it was read with `center_volume=False`.
+- xvr (`register/pose.py`, `register/logging.py`): the pose of DiffDRR as Euler angles ZXY in radians, and a translation
+  that is turned by them; its files hold the matrix. Its pictures are without `reverse_x_axis` unless it is told
+  otherwise, those of its versions before 2026 were with it: its files say which.
 - xReg (`xregPerspectiveXform.h`): a pose takes the C-arm's world to the CT's LPS, extrinsics the world to the camera,
   whose z leads from detector to source, or the other way.
 """
@@ -25,7 +28,6 @@ from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Camera, check_rigid, invert_rigid
 
 _RAS_FROM_LPS = torch.diag(torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64))
-_AGAINST = torch.diag(torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64))  # DiffDRR's axes in the stored picture's
 _NEGATIVE_Z = "origin-at-focal-pt-det-neg-z"  # xReg's names for where the detector lies
 _POSITIVE_Z = "origin-at-focal-pt-det-pos-z"
 _FLAT = 0.5  # determinant of a rotation that is none; `check_rigid` is told the exact one
@@ -86,46 +88,88 @@ def _to_origin(middle_lps: Tensor) -> Tensor:
     return shift
 
 
-def to_diffdrr(camera_from_lps: Tensor, display: Display, middle_lps: Tensor, orientation: str | None = "AP") -> Tensor:
-    """DiffDRR's pose (4, 4), as `RigidTransform` takes it, with `reverse_x_axis=True`.
+def _stored_from_diffdrr(reverse_x_axis: bool) -> Tensor:
+    """DiffDRR's axes in the stored picture's."""
+    return torch.diag(torch.tensor([-1.0 if reverse_x_axis else 1.0, -1, 1, 1], dtype=torch.float64))
 
-    `middle_lps` (3,) is the middle of the CT's grid; `orientation` is what `diffdrr.data.read` was given. Pictures that
-    are mirror images of what the source sees are those of "PA". Raises `InputError` for the other one.
+
+def to_diffdrr(
+    camera_from_lps: Tensor,
+    display: Display,
+    middle_lps: Tensor,
+    orientation: str | None = "AP",
+    reverse_x_axis: bool = True,
+) -> Tensor:
+    """DiffDRR's pose (4, 4), as `RigidTransform` takes it.
+
+    `middle_lps` (3,) is the middle of the CT's grid, or 0 if DiffDRR reads it with `center_volume=False`. `orientation`
+    is what `diffdrr.data.read` is given, `reverse_x_axis` what `diffdrr.drr.DRR` is given, with DiffDRR's defaults.
+    "PA" shows mirror images of what the source sees, and so does `reverse_x_axis=False`; together they do not. Raises
+    `InputError` where these do not fit `display`.
     """
     ras_from_stored = _to_origin(middle_lps) @ to_nanodrr(camera_from_lps, display)
-    pose = ras_from_stored @ _AGAINST @ torch.linalg.inv(_REORIENT[orientation])
+    pose = ras_from_stored @ _stored_from_diffdrr(reverse_x_axis) @ torch.linalg.inv(_REORIENT[orientation])
     if torch.linalg.det(pose[:3, :3]) < 0:
-        raise InputError(f"DiffDRR: its orientation {orientation} shows no picture that is stored as {display} says.")
+        raise InputError(
+            f"DiffDRR: its orientation {orientation} with reverse_x_axis={reverse_x_axis} shows no picture that is "
+            f"stored as {display} says. Change one of the two, or turn the picture's columns round."
+        )
     return pose
 
 
-def from_diffdrr(pose: Tensor, display: Display, middle_lps: Tensor, orientation: str | None = "AP") -> Tensor:
+def from_diffdrr(
+    pose: Tensor,
+    display: Display,
+    middle_lps: Tensor,
+    orientation: str | None = "AP",
+    reverse_x_axis: bool = True,
+) -> Tensor:
     """The inverse of `to_diffdrr`. Raises `InputError` if the pose is mirrored or not rigid."""
-    ras_from_stored = torch.linalg.inv(_to_origin(middle_lps)) @ pose.double() @ _REORIENT[orientation] @ _AGAINST
+    diffdrr_from_stored = _REORIENT[orientation] @ _stored_from_diffdrr(reverse_x_axis)
+    ras_from_stored = torch.linalg.inv(_to_origin(middle_lps)) @ pose.double() @ diffdrr_from_stored
     inverse = display.camera_from_stored @ torch.linalg.inv(ras_from_stored) @ _RAS_FROM_LPS
     return _pose(inverse, "DiffDRR", display)
 
 
-def diffdrr_offsets(stored: Camera) -> tuple[float, float]:
+def diffdrr_offsets(stored: Camera, reverse_x_axis: bool = True) -> tuple[float, float]:
     """`x0` and `y0`, mm, that `diffdrr.drr.DRR` is to be given for the camera of the stored pictures."""
     (column, row), (rows, columns) = stored.principal_point_px, stored.shape
-    return (column - (columns - 1) / 2) * stored.pixel_mm[1], (row - (rows - 1) / 2) * stored.pixel_mm[0]
+    x, y = (column - (columns - 1) / 2) * stored.pixel_mm[1], (row - (rows - 1) / 2) * stored.pixel_mm[0]
+    return x if reverse_x_axis else -x, y
 
 
-def to_xvr(camera_from_lps: Tensor, display: Display, middle_lps: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotation (3,), Euler angles ZXY in radians, and translation (3,), mm, of xvr."""
-    pose = to_diffdrr(camera_from_lps, display, middle_lps)
+def to_xvr(
+    camera_from_lps: Tensor,
+    display: Display,
+    middle_lps: Tensor,
+    *,
+    reverse_x_axis: bool,
+    orientation: str | None = "AP",
+) -> tuple[Tensor, Tensor]:
+    """Rotation (3,), Euler angles ZXY in radians, and translation (3,), mm, of xvr.
+
+    What `xvr register fixed` takes in degrees; arguments as for `to_diffdrr`, and what xvr itself is told.
+    """
+    pose = to_diffdrr(camera_from_lps, display, middle_lps, orientation, reverse_x_axis)
     turn = pose[:3, :3]
     angles = Rotation.from_matrix(turn.numpy()).as_euler("ZXY")
     return torch.from_numpy(np.ascontiguousarray(angles)), turn.mT @ pose[:3, 3]
 
 
-def from_xvr(rotation: Tensor, translation: Tensor, display: Display, middle_lps: Tensor) -> Tensor:
+def from_xvr(
+    rotation: Tensor,
+    translation: Tensor,
+    display: Display,
+    middle_lps: Tensor,
+    *,
+    reverse_x_axis: bool,
+    orientation: str | None = "AP",
+) -> Tensor:
     """The inverse of `to_xvr`."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.from_numpy(Rotation.from_euler("ZXY", rotation.double().numpy()).as_matrix())
     pose[:3, 3] = pose[:3, :3] @ translation.double()
-    return from_diffdrr(pose, display, middle_lps)
+    return from_diffdrr(pose, display, middle_lps, orientation, reverse_x_axis)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,14 +18,13 @@ from femoreg_torch.fluoro import (
     Polygon,
     StoredImage,
     attenuation_image,
+    check_header,
     check_matches,
-    contradictions,
     find_distortion,
     find_shutter,
     read_image,
     read_stored,
     settled_intensity,
-    side_remarks,
     without_penumbra,
 )
 from femoreg_torch.registration.models import model_attenuation
@@ -263,10 +262,9 @@ def _read_image(case: Case, index: int, kind: Kind) -> _Image:
     stored = read_stored(view.images[kind], view.frames)
     as_stored = display.stored_camera(camera)
     check_matches(stored.values, as_stored, where)
-    if stored.tags is not None and (wrong := contradictions(stored.tags, as_stored, display, case.carm.uncertainty)):
-        raise InputError(f"{where}: {view.images[kind].name}, {'; '.join(wrong)}.")
-    unsaid = [] if stored.tags is None else side_remarks(stored.tags, display)
-    logarithms = settled_intensity(view.intensity, stored, f"{where}: {view.images[kind].name}") == "log"
+    file = f"{where}: {view.images[kind].name}"
+    check_header(stored.tags, as_stored, display, case.carm.uncertainty, file)
+    logarithms = settled_intensity(view.intensity, stored, file) == "log"
     distortion = view_distortion(case, index)
     straight = stored.values if distortion is None else distortion.straightened(stored.values)
     image = display.to_camera(straight)
@@ -279,7 +277,6 @@ def _read_image(case: Case, index: int, kind: Kind) -> _Image:
     remarks = (
         *bent,
         *(f"{view.images[kind].name} {remark}" for remark in stored.remarks),
-        *(f"{view.images[kind].name}: {remark}" for remark in unsaid),
         *([shutter] if shutter else []),
     )
     return _Image(

@@ -21,6 +21,11 @@ _FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
 
 
 def _signs(space: Any, where: str) -> tuple[float, float, float]:
+    if space is None:
+        raise InputError(
+            f'{where}: the file does not say it. Write `"coordinateSystem": "LPS"`, or "RAS", beside `controlPoints`, '
+            "or save the points anew with 3D Slicer."
+        )
     if not isinstance(space, str) or space not in _LPS_FROM:
         raise InputError(f"{where}: the space must be LPS or RAS, found {shortened(space)}.")
     return _LPS_FROM[space]

@@ -51,7 +51,7 @@ def _oriented(image: sitk.Image, path: Path) -> sitk.Image:
         size = " × ".join(str(n) for n in image.GetSize())
         raise InputError(
             f"{path}: a 3-D volume of one channel was expected, found {size} voxels of "
-            f"{image.GetNumberOfComponentsPerPixel()} channel(s)."
+            f"{image.GetNumberOfComponentsPerPixel()} channel(s). Save one volume of it as a file of its own."
         )
     spacing = image.GetSpacing()
     if not (min(spacing) >= _FINEST_MM and max(spacing) <= _COARSEST_MM):

@@ -220,7 +220,7 @@ def run_trial(study: CadaverStudy, case: Path, out: Path, number: int) -> dict[s
     write_measured(out, procedure, found)
     run = out / "run"
     if not (run / RESULT_NAME).is_file():
-        register_into(run, out, study.preset, number)
+        register_into(run, read_case(out), study.preset, number)
     result = read_result(run)
     points = bead_points(procedure, (FEMUR, DEVICE))
     own = metric_deviations(pose_uncertainty(found.bundle, points), found.bundle.poses, points)

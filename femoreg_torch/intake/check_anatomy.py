@@ -1,0 +1,136 @@
+"""What is wrong with CT, label map, landmarks and planned path of a case, and the three planes that show them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.anatomy import HIP, Anatomy, LabelTable
+from femoreg_torch.case import Case
+from femoreg_torch.case.femoroplasty import femoral_head, operated_femur
+from femoreg_torch.case.fields import Fields
+from femoreg_torch.case.model import PlannedPath, Side
+from femoreg_torch.case.parts import read_bones
+from femoreg_torch.errors import InputError
+from femoreg_torch.intake.found import Found
+from femoreg_torch.intake.planes import Picture, three_planes
+from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
+from femoreg_torch.pnp import MINIMUM
+from femoreg_torch.volume import (
+    BoneLabels,
+    Volume,
+    bone_labels,
+    check_inside,
+    read_ct_told,
+    read_labels_told,
+    stray_landmarks,
+    swapped_sides,
+)
+from femoreg_torch.volume.bones import nearest_label
+
+
+@dataclass(frozen=True, eq=False)
+class SeenAnatomy:
+    """CT, bones and landmarks, as far as they could be read."""
+
+    ct: Volume | None = None
+    bones: BoneLabels | None = None
+    landmarks: Mapping[str, Tensor] = field(default_factory=dict)
+    anatomy: Anatomy | None = None
+
+
+def check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: Found) -> SeenAnatomy:
+    path = found.attempt(lambda: ct.file_path("image", folder, may_be_folder=True))
+    labels_path = None
+    if "labels" not in ct:
+        found.problem(f"{ct.where('labels')}: is missing, a label map of the bones was expected.")
+    else:
+        labels_path = found.attempt(lambda: ct.file_path("labels", folder, may_be_folder=True))
+    table = found.attempt(lambda: read_bones(ct, folder, HIP)) if labels_path is not None else None
+    volume = None
+    read = None if path is None else found.attempt(lambda: read_ct_told(path))
+    if read is not None and path is not None:
+        volume, told = read
+        found.warnings += [*told, *header_warnings(path), *ct_warnings(volume)]
+        found.facts.append(f"CT: {described(volume)}")
+    bones = None
+    if volume is not None and labels_path is not None and table is not None:
+        bones = found.attempt(lambda: check_bones(labels_path, volume, table, HIP, marks, found))
+    return SeenAnatomy(volume, bones, marks, HIP)
+
+
+def check_bones(
+    path: Path, ct: Volume, table: LabelTable, anatomy: Anatomy | None, marks: Mapping[str, Tensor], found: Found
+) -> BoneLabels:
+    labels, told = read_labels_told(path, ct, {n for ids in table.values() for n in ids})
+    found.warnings += told
+    bones = bone_labels(labels, ct, table, anatomy, marks)
+    found.facts.append(f"bones: {', '.join(bones.ids)}")
+    for bone, ids in bones.absent.items():
+        found.warnings.append(f"no voxel of {path.name} carries the label {', '.join(map(str, ids))}, the {bone}")
+    return bones
+
+
+def check_landmarks(seen: SeenAnatomy, found: Found) -> None:
+    if seen.landmarks and len(seen.landmarks) < MINIMUM:
+        found.problem(
+            f"landmarks: {len(seen.landmarks)} of them, but the start pose takes at least {MINIMUM}. Place more of "
+            f"{', '.join(HIP.landmark_names)}."
+        )
+    outside = set()
+    if seen.ct is not None:
+        for name, point in seen.landmarks.items():
+            try:
+                check_inside({name: point}, seen.ct)
+            except InputError as error:
+                found.problem(str(error))
+                outside.add(name)
+    if seen.bones is not None:
+        inside = {name: point for name, point in seen.landmarks.items() if name not in outside}
+        swapped = swapped_sides(seen.bones, inside, seen.anatomy)
+        for told in swapped or stray_landmarks(seen.bones, inside, seen.anatomy):
+            found.problem(f"{told}.")
+
+
+def check_path(path: PlannedPath, side: Side, seen: SeenAnatomy, found: Found) -> None:
+    """The entry point lies on the operated femur, and the target nearer to its head."""
+    if not (path.target - path.entry_point).norm() > 1e-6:
+        found.problem("plan: entry point and target are the same point, so the path has no direction. Move one.")
+        return
+    head = seen.landmarks[femoral_head(side)]
+    if (path.entry_point - head).norm() < (path.target - head).norm():
+        found.problem("plan: the entry point lies nearer to the femoral head than the target. Exchange the two.")
+    if seen.bones is None or operated_femur(side) not in seen.bones.ids:
+        return  # which is told
+    femora = {seen.bones.ids[name]: name for name in ("femur_left", "femur_right") if name in seen.bones.ids}
+    ends = {"entry point": path.entry_point, "target": path.target}
+    for name, point in ends.items():
+        if torch.equal(point, head):
+            continue  # a landmark, which is looked at by itself
+        label = nearest_label(seen.bones.labels, list(femora), point)
+        where = ", ".join(f"{v:.1f}" for v in point.tolist())
+        if label is None:
+            found.problem(
+                f"plan: the {name} ({where}) mm LPS lies near no femur of the label map. Check RAS/LPS, or move it."
+            )
+        elif femora[label] != operated_femur(side):
+            found.problem(
+                f"plan: the {name} lies on the {femora[label]}, but `side` is {side}. Correct one of the two."
+            )
+
+
+def planes_of(seen: SeenAnatomy, case: Case | None) -> Picture | None:
+    """Three planes of the CT with bones, landmarks and the planned path, as far as they could be read."""
+    if seen.ct is None:
+        return None
+    marks = dict(seen.landmarks)
+    if case is not None and case.plan is not None:
+        marks["entry"] = case.plan.entry_point
+    colours = {}
+    if seen.bones is not None and seen.anatomy is not None:
+        names = [bone.name for bone in seen.anatomy.bones if bone.name in seen.bones.ids]
+        colours = {seen.bones.ids[name]: seen.anatomy.bone(name).colour for name in names}
+    head = seen.landmarks.get(femoral_head(case.side)) if case is not None and case.side is not None else None
+    return three_planes(seen.ct, None if seen.bones is None else seen.bones.labels, colours, marks, head)
