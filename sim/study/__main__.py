@@ -106,7 +106,7 @@ def accuracy(
 def capture_range(
     preset: str = "fast",
     first: int = 4,
-    starts: int = 24,
+    starts: int = 96,
     kind: Kind = "all",
     out: Path = _OUT,
     patients: Path | None = None,

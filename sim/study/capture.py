@@ -27,8 +27,8 @@ LEVELS = (0.2, 0.4, 0.6, 0.8, 1.0)  # shares of these, singly and, as `jointly`,
 AXIS_LABELS = {
     "rotation": "rotation, °",
     "depth": "depth, mm",
-    "lateral": "shift in the image plane, mm",
-    "jointly": "% of 30°, 100 mm and 40 mm",
+    "lateral": "shift in the image, mm",
+    "jointly": "% of all three",
 }
 
 
