@@ -46,7 +46,7 @@
     if (!state) return;
     show(state);
     if (state.message) say(state.message, true);
-    else if (!running()) say("");
+    else if (address === "change") say("");
   };
   const show = (state) => {
     const before = shown && shown.progress && shown.progress.state, decided = shown && shown.decided;
