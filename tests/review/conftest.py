@@ -28,7 +28,7 @@ steps:
     kinds: [all]
     render: [pelvis, femur]
     bodies: [{move: [pelvis, femur], rotation_deg: [2, 2, 2], translation_mm: [3, 3, 10]}]
-    level: {pixel_mm: 6, step_mm: 3}
+    level: {pixel_mm: 3, step_mm: 3}
     similarity: {kind: grad_ncc, patch_radius: 3}
     optimiser: {kind: levenberg_marquardt, max_iterations: 8, tol_x: 0.01, tol_f: 0.00001}
 """

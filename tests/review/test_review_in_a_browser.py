@@ -4,16 +4,14 @@ The server is the command itself, and the registration a real one of a small cas
 """
 
 import json
-import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import psutil
 import pytest
 import torch
 
@@ -27,10 +25,13 @@ from femoreg_torch.review.kept import landmarks_path, start_path
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright here: it comes with the extra `dev`")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="no Chromium here: install your distribution's, such as `apt-get install chromium`"
-)
-SLOW_MS = 120_000  # the longest that anything may take on a machine with much else to do
+pytestmark = [
+    pytest.mark.long,  # it starts the command three times, and a registration each time
+    pytest.mark.skipif(
+        CHROMIUM is None, reason="no Chromium here: install your distribution's, such as `apt-get install chromium`"
+    ),
+]
+SLOW_MS = 60_000  # the longest that anything may take on a machine with much else to do
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +48,7 @@ class Server:
     def __init__(self, order: Order) -> None:
         command = [sys.executable, "-m", "femoreg_torch.commands.main", "review", str(order.case)]
         options = ["--out", str(order.out), "--preset", order.preset]
-        self.process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True, start_new_session=True)
+        self.process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
         found = next(filter(None, (re.search(r"http://\S+/", line) for line in self.process.stdout)), None)
         assert found is not None
@@ -58,13 +59,9 @@ class Server:
         self.process.communicate()
 
 
-def group_is_gone(group: int) -> bool:
-    """Whether no process of a group is left, not even one that the server started."""
-    try:
-        os.killpg(group, 0)
-    except ProcessLookupError:
-        return True
-    return False
+def ended(process: psutil.Process) -> bool:
+    """Whether a process runs no more; nobody may have asked for its exit status yet."""
+    return not process.is_running() or process.status() == psutil.STATUS_ZOMBIE
 
 
 @pytest.fixture
@@ -76,7 +73,7 @@ def served(order: Order) -> Iterator[Server]:
 
 def opened(browser: Any, address: str) -> Any:
     """A page that notes what it asks for and complains of, once its edges are drawn."""
-    page = browser.new_page(viewport={"width": 1200, "height": 900})
+    page = browser.new_page(viewport={"width": 1200, "height": 1600})
     page.set_default_timeout(SLOW_MS)
     page.asked, page.complaints = [], []
     page.on("request", lambda request: page.asked.append(request.url))
@@ -106,6 +103,20 @@ def state(page: Any) -> Any:
     return page.evaluate("fetch('drawing').then(answer => answer.json())")
 
 
+def middle(found: Any) -> Any:
+    """Where the pelvis is seen."""
+    return found["drawing"]["views"][0]["centres"]["pelvis"]
+
+
+def until(page: Any, holds: Callable[[Any], bool]) -> None:
+    """Wait until something holds of the state of the review."""
+    for _ in range(SLOW_MS // 100):
+        if holds(state(page)):
+            return
+        page.wait_for_timeout(100)
+    pytest.fail(f"still: {json.dumps({**state(page), 'drawing': None})}")
+
+
 def test_landmarks_and_objects_are_dragged_registered_accepted_and_found_again(
     served: Server, browser: Any, order: Order, drawn_scene: tuple[Any, Scene], true_pose: torch.Tensor
 ) -> None:
@@ -122,11 +133,11 @@ def test_landmarks_and_objects_are_dragged_registered_accepted_and_found_again(
     # a landmark goes where it is dragged, and back; one is removed
     column, row = pixels[0]
     drag(page, (column, row), (column + 9, row - 6))
-    page.wait_for_function("fetch('state').then(a => a.json()).then(s => s.revision === 8)")
+    until(page, lambda found: found["revision"] == 8)
     there = state(page)["drawing"]["landmarks"]["FH-l"]
     assert there == pytest.approx([column + 9, row - 6], abs=0.5)
     drag(page, (column + 9, row - 6), (column, row))
-    page.wait_for_function("fetch('state').then(a => a.json()).then(s => s.revision === 9)")
+    until(page, lambda found: found["revision"] == 9)
     page.get_by_role("button", name="ASIS-l").click()
     page.get_by_role("button", name="Remove").click()
     page.locator(".mark[data-name=ASIS-l]").wait_for(state="detached")
@@ -134,19 +145,17 @@ def test_landmarks_and_objects_are_dragged_registered_accepted_and_found_again(
 
     # landmarks place the bones; then all of them are dragged away, and turned by their handle
     page.get_by_role("button", name="Place objects by landmarks").click()
-    page.wait_for_function("fetch('state').then(a => a.json()).then(s => s.revision === 11)")
-    before = state(page)["drawing"]["views"][0]["centres"]["pelvis"]
+    until(page, lambda found: found["revision"] == 11)
+    before = middle(state(page))
     page.get_by_label("all objects").check()
     drag(page, (48, 70), (54, 66))
-    page.wait_for_function("fetch('drawing').then(a => a.json()).then(d => d.drawing.views[0].centres.pelvis[0])")
-    page.wait_for_timeout(300)
-    after = state(page)["drawing"]["views"][0]["centres"]["pelvis"]
-    assert [after[0] - before[0], after[1] - before[1]] == pytest.approx([6, -4], abs=0.3)
+    until(page, lambda found: middle(found) == pytest.approx([before[0] + 6, before[1] - 4], abs=0.3))
     assert start_path(order.out).is_file()
 
     # the registration brings them back, while a second tab watches and can neither start another nor move anything
     second = opened(browser, served.address)
     page.get_by_role("button", name="Start from objects").click()
+    page.get_by_text("Registering:").wait_for()
     answer = second.evaluate(
         """fetch('start', {method: 'POST', headers: {'Content-Type': 'application/json'},
             body: JSON.stringify({source: 'objects', revision: 0})}).then(answer => answer.json())"""
@@ -157,7 +166,7 @@ def test_landmarks_and_objects_are_dragged_registered_accepted_and_found_again(
     for tab in (page, second):  # both show the result by themselves
         tab.locator(".card.good, .card.bad").wait_for()
     found = read_result(order.out).poses.camera1_from["pelvis"]
-    assert float((found - true_pose)[:2, 3].norm()) < 1.5
+    assert float((found - true_pose)[:2, 3].norm()) < 4  # of 15 mm
     assert not landmarks_path(order.out).exists()
 
     page.get_by_label("Your name").fill("A. Surgeon")
@@ -184,19 +193,19 @@ def test_a_server_that_is_killed_in_mid_run_leaves_no_run_and_what_was_placed(
     page = opened(browser, served.address)
     page.get_by_label("femur").check()
     drag(page, (48, 70), (50, 70))
-    page.wait_for_function("fetch('state').then(a => a.json()).then(s => s.revision > 0)")
+    until(page, lambda found: found["revision"] > 0)
     page.get_by_role("button", name="Start from objects").click()
     page.get_by_text("Registering:").wait_for()
     kept = json.loads(start_path(order.out).read_text(encoding="utf-8"))
-    os.kill(served.process.pid, signal.SIGKILL)
-    served.process.wait()
+    children = psutil.Process(served.process.pid).children(recursive=True)
+    assert children
+    served.kill()
     page.get_by_text("The server does not answer").wait_for()
-    page.wait_for_timeout(100)
     for _ in range(100):
-        if group_is_gone(served.process.pid):
+        if all(map(ended, children)):
             break
         page.wait_for_timeout(100)
-    assert group_is_gone(served.process.pid)
+    assert all(map(ended, children))
     assert not order.out.exists()
     again = Server(order)
     try:
