@@ -176,7 +176,7 @@ def end_with_parent() -> None:
     from threading import Thread
 
     parent = parent_process()
-    assert parent is not None  # called in processes of a pool alone
+    assert parent is not None  # called in processes that another one started
 
     def watch() -> None:
         parent.join()

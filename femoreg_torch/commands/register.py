@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     import torch
 
     from femoreg_torch.case import Case, Result
-    from femoreg_torch.registration.workflow import Report
+    from femoreg_torch.registration.workflow import Follow, Report
 
 
 def register(
@@ -102,10 +102,11 @@ def register_into(
     robot: Path | None = None,
     device: "torch.device | None" = None,
     report: "Report | None" = None,
+    follow: "Follow | None" = None,
 ) -> "tuple[Result, dict[str, Any] | None]":
     """Register a case and write all that belongs to its run into `out`; see `register`.
 
-    Without a `device`, it computes on the CPU.
+    Without a `device`, it computes on the CPU. `follow` is told the poses after every optimisation.
 
     Returns the result, and the content of navigation.json if there is any. Raises `InputError`.
     """
@@ -139,6 +140,7 @@ def register_into(
         start=None if start is None else read_start_poses(start),
         device=device or CPU,
         report=report or silent,
+        follow=follow,
     )
     result = replace(
         result, errors=evaluate(case, result, scene), case=os.path.relpath(case.folder.resolve(), out.resolve())

@@ -108,6 +108,27 @@ def overlay_figure(case: Case, scene: Scene, poses: Poses, drawn: Drawn | None =
     return np.vstack(rows)
 
 
+class Renderer:
+    """DRRs of the objects in the views, the last one of each kept: from frame to frame most stand still."""
+
+    def __init__(self, scene: Scene, camera: Camera, step_mm: float = 1.0) -> None:
+        self._scene, self._camera, self._step_mm = scene, camera, step_mm
+        self.colours = object_colours(scene.objects)
+        self._last: dict[tuple[str, int], tuple[Camera, Tensor, Tensor]] = {}
+
+    def __call__(self, poses: Poses, name: str, view: int) -> Tensor:
+        """Line integrals (H, W) of one object in one view."""
+        camera_from_object = poses.camera_from(name)[view]
+        camera = poses.camera(view, self._camera)
+        last = self._last.get((name, view))
+        if last is not None and last[0] == camera and torch.equal(last[1], camera_from_object):
+            return last[2]
+        volume = self._scene.objects[name].volume
+        drawn = project(volume, camera_from_object[None], camera, self._step_mm)[0]
+        self._last[name, view] = (camera, camera_from_object, drawn)
+        return drawn
+
+
 def new_objects(scene: Scene) -> dict[str, list[str]]:
     """For every kind of images, the objects that no kind before it shows."""
     shown: set[str] = set()

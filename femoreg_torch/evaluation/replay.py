@@ -9,17 +9,22 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from torch import Tensor
 
 from femoreg_torch.case import Case, Result, Verdict
-from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation.colours import OBJECT_COLOURS, Colour, object_colours
+from femoreg_torch.evaluation.colours import OBJECT_COLOURS, Colour
 from femoreg_torch.evaluation.fit import check_fits
-from femoreg_torch.evaluation.overlay import Picture, monitor_picture, new_objects, paint_edges, small_field
+from femoreg_torch.evaluation.overlay import (
+    Picture,
+    Renderer,
+    monitor_picture,
+    new_objects,
+    paint_edges,
+    small_field,
+)
 from femoreg_torch.files import temporary_file
 from femoreg_torch.fluoro import downsample
-from femoreg_torch.geometry import Camera, Poses
+from femoreg_torch.geometry import Poses
 from femoreg_torch.registration import Scene, prepare_scene
 from femoreg_torch.registration.scene import Kind
 from femoreg_torch.similarity import FixedSimilarity, GradNcc, against_field
@@ -163,7 +168,7 @@ def draw_frames(
             field = small_field(scene, kind, number, factor)
             backgrounds[kind, number] = monitor_picture(small, field)
             similarities[kind, number] = against_field(GradNcc(_PATCH_RADIUS), small, None, field)
-    renderer = _Renderer(scene, camera)
+    renderer = Renderer(scene, camera)
     for index, frame in enumerate(frames):
         rows = []
         for kind in scene.images:
@@ -184,33 +189,13 @@ def draw_frames(
         yield np.vstack([_bar(width, (frame.stage, _WHITE), (frame.detail, _WHITE)), *rows, _bar(width, *foot)])
 
 
-class _Renderer:
-    """DRRs of the objects in the views, the last one of each kept: from frame to frame most stand still."""
-
-    def __init__(self, scene: Scene, camera: Camera) -> None:
-        self._scene, self._camera = scene, camera
-        self.colours = object_colours(scene.objects)
-        self._last: dict[tuple[str, int], tuple[Camera, Tensor, Tensor]] = {}
-
-    def __call__(self, poses: Poses, name: str, view: int) -> Tensor:
-        """Line integrals (H, W) of one object in one view."""
-        camera_from_object = poses.camera_from(name)[view]
-        camera = poses.camera(view, self._camera)
-        last = self._last.get((name, view))
-        if last is not None and last[0] == camera and torch.equal(last[1], camera_from_object):
-            return last[2]
-        drawn = project([self._scene.objects[name].volume], camera_from_object[None, None], camera)[0]
-        self._last[name, view] = (camera, camera_from_object, drawn)
-        return drawn
-
-
 def _panel(
     picture: Picture,
     view: int,
     edged: list[str],
     drawn: list[str],
     frame: Frame,
-    renderer: _Renderer,
+    renderer: Renderer,
     similarity: FixedSimilarity,
 ) -> Picture:
     """One image with the edges of what it shows first and has its place by then, and the similarity of all drawn."""

@@ -49,12 +49,11 @@ def write_report(case: Case, result: Result, run: Path) -> dict[str, Any] | None
     return found
 
 
-def evaluation_page(case: Case, result: Result) -> str:
-    """The report alone, as text. Raises `InputError` if the result does not fit the case."""
+def evaluation_page(case: Case, result: Result, scene: Scene) -> str:
+    """The report alone, as text, from the scene of the case. Raises `InputError` if the result does not fit it."""
     from femoreg_torch.evaluation.report import report_page
     from femoreg_torch.evaluation.report.pictures import PANEL_PX
 
     check_fits(case, result)
-    scene = prepare_scene(case)
     found = evaluate(case, result, scene)
     return report_page(case, scene, result, found, draw(scene, result.poses, PANEL_PX))

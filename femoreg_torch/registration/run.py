@@ -30,7 +30,7 @@ from femoreg_torch.registration.start import (
     start_by_landmarks,
     with_segmentations,
 )
-from femoreg_torch.registration.workflow import Report, run_plan
+from femoreg_torch.registration.workflow import Follow, Report, run_plan
 
 
 def versions() -> dict[str, str]:
@@ -110,8 +110,12 @@ def register_scene(
     start: Mapping[str, Tensor] | None = None,
     device: torch.device = CPU,
     report: Report = silent,
+    follow: Follow | None = None,
 ) -> tuple[Result, Scene]:
-    """As `register`, from the scene of the case if it is there already; returns that as well."""
+    """As `register`, from the scene of the case if it is there already; returns that as well.
+
+    `follow` is told the poses after every optimisation, and those at the start.
+    """
     plan = plan if isinstance(plan, Plan) else load_plan(plan)
     clock = {"began": time.perf_counter()}
     report("reading CT and images", 0.0)
@@ -132,7 +136,9 @@ def register_scene(
     began, scene = _start(case, scene, plan, look, landmarks, report)
     clock["started"] = time.perf_counter()
     anchor = began.camera1_from_object if scene.needs_landmarks else None
-    outcome = run_plan(scene, plan, anchor, seed, report)
+    if follow is not None:
+        follow(scene.start(anchor))
+    outcome = run_plan(scene, plan, anchor, seed, report, follow)
     clock["registered"] = time.perf_counter()
     told, scene = scene, outcome.scene
     covariance = final_covariance(scene, outcome.poses, plan.imaging)

@@ -13,6 +13,7 @@ from femoreg_torch.registration.plan import Plan
 from femoreg_torch.registration.scene import Scene
 
 Report = Callable[[str, float], None]  # what is done, and the share of the plan behind it
+Follow = Callable[[Poses], None]  # where everything is after each optimisation of a step
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +27,12 @@ class Outcome:
 
 
 def run_plan(
-    scene: Scene, plan: Plan, camera1_from_anchor: Tensor | None, seed: int, report: Report | None = None
+    scene: Scene,
+    plan: Plan,
+    camera1_from_anchor: Tensor | None,
+    seed: int,
+    report: Report | None = None,
+    follow: Follow | None = None,
 ) -> Outcome:
     """Run all steps of a plan from where landmarks put the scene's anchor, (4, 4), and where all else starts.
 
@@ -50,6 +56,8 @@ def run_plan(
         for record in records:
             trace.append(record)
             poses = record.poses
+            if follow:
+                follow(poses)
     if report:
         report("done", 1.0)
     skipped = (f"stage “{plan.steps[n].name}” was left out: {reason}" for n, reason in reasons.items() if reason)

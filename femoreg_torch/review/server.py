@@ -1,108 +1,164 @@
-"""The local server of a review: the report of a run beside a form that accepts or rejects it.
+"""The local server of a review: its page, the state that the page asks for, and what the page may change.
 
 Who may ask: only this machine (the server listens on the loopback address alone), only under a host name of this
 machine (so that no web page reaches it under a name of its own, by DNS rebinding), only with the token in the address,
-and a decision only from the page itself. Pages load nothing from outside.
+and changes only from the page itself. Pages load nothing from outside, and no request names a file.
 """
 
 import hmac
 import socket
+from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime
-from pathlib import Path
 from urllib.parse import parse_qs
 
-import jinja2
 import uvicorn
 from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route
 
-from femoreg_torch.case import Result
-from femoreg_torch.case.review import Decision, Review, read_review, result_sha256, write_review
-from femoreg_torch.navigation.report import NOTICE
+from femoreg_torch.case.review import Decision
+from femoreg_torch.errors import InputError
+from femoreg_torch.review.desk import Change, Desk, RefusedError, Source
+from femoreg_torch.review.page import review_page
+from femoreg_torch.settings import read_record
+from femoreg_torch.text import json_content
 
 LOOPBACK = "127.0.0.1"
 _HOSTS = [LOOPBACK, "localhost"]
-_MOST_BYTES = 40_000  # of a decision
-_POLICY = (
-    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; frame-src 'self'; form-action 'self'; "
-    "frame-ancestors 'none'; base-uri 'none'"
-)
+_MOST_BYTES = 40_000  # of a request
+_JSON = "application/json"
+_SOURCES: tuple[Source, ...] = ("landmarks", "objects", "network")
 # With the policy `no-referrer` browsers would hide where a decision comes from, from this server too.
 _HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "same-origin", "X-Content-Type-Options": "nosniff"}
+Handler = Callable[[Request], Awaitable[Response]]
 
 
-def review_app(run: Path, result: Result, report: str, digest: str, token: str) -> Starlette:
-    """The application for one run.
+def review_app(desk: Desk, token: str) -> Starlette:
+    """The application of one review."""
 
-    `report` is the page of its `result`, and `digest` that of the result.json that the page was made from: a decision
-    is refused once another result stands there.
-    """
-    template = jinja2.Environment(
-        loader=jinja2.PackageLoader("femoreg_torch.review"), autoescape=True, undefined=jinja2.StrictUndefined
-    ).get_template("review.html")
+    def guarded(answer: Handler) -> Handler:
+        """An answer for those alone who know the token, and, to changes, those alone that come from the page."""
 
-    def refused(request: Request) -> Response | None:
-        given = str(request.path_params["token"])
-        if hmac.compare_digest(given.encode(), token.encode()):
-            return None
-        return PlainTextResponse("Wrong address: open the one that `femoreg review` printed.", 403, _HEADERS)
+        async def checked(request: Request) -> Response:
+            given = str(request.path_params["token"])
+            if not hmac.compare_digest(given.encode(), token.encode()):
+                return _told("Wrong address: open the one that `femoreg review` printed.", 403)
+            origin = request.headers.get("origin")
+            if request.method == "POST" and origin is not None and origin != f"http://{request.headers['host']}":
+                return _told("This request comes from another page.", 403)
+            return await answer(request)
 
-    def page(message: str = "", status: int = 200) -> Response:
-        text = template.render(
-            name=run.resolve().name,
-            verdict=result.verdict,
-            review=read_review(run),
-            current=digest,
-            changed=result_sha256(run) != digest,
-            message=message,
-            notice=NOTICE,
-        )
-        return HTMLResponse(text, status, {**_HEADERS, "Content-Security-Policy": _POLICY})
+        return checked
 
-    def show(request: Request) -> Response:
-        return refused(request) or page()
+    async def page(message: str = "", status: int = 200) -> Response:
+        text, policy = await run_in_threadpool(review_page, desk, message)
+        return HTMLResponse(text, status, {**_HEADERS, "Content-Security-Policy": policy})
 
-    def show_report(request: Request) -> Response:
-        frame = {"Content-Security-Policy": "frame-ancestors 'self'"}
-        return refused(request) or HTMLResponse(report, headers={**_HEADERS, **frame})
+    async def show(_: Request) -> Response:
+        return await page()
+
+    async def show_report(_: Request) -> Response:
+        try:
+            text = await run_in_threadpool(desk.report)
+        except RefusedError as error:
+            return _told(str(error), 404)
+        return HTMLResponse(text, headers={**_HEADERS, "Content-Security-Policy": "frame-ancestors 'self'"})
+
+    async def state(_: Request) -> Response:
+        return JSONResponse(await run_in_threadpool(desk.state), headers=_HEADERS)
+
+    async def drawing(_: Request) -> Response:
+        return JSONResponse(await run_in_threadpool(desk.drawing), headers=_HEADERS)
+
+    async def change(request: Request) -> Response:
+        return await carried_out(request, lambda content: desk.change(read_record(Change, content, "change")))
+
+    async def start(request: Request) -> Response:
+        def begin(content: dict[str, object]) -> None:
+            source = next((source for source in _SOURCES if source == content.get("source")), None)
+            revision = content.get("revision")
+            if source is None or not isinstance(revision, int):
+                raise InputError(f"start: a source ({', '.join(_SOURCES)}) and a revision were expected.")
+            desk.start(source, revision)
+
+        return await carried_out(request, begin)
+
+    async def cancel(request: Request) -> Response:
+        return await carried_out(request, lambda _: desk.cancel())
+
+    async def carried_out(request: Request, act: Callable[[dict[str, object]], None]) -> Response:
+        """Do what a request asks for, and answer with the state and drawing after it, and what was wrong, in words."""
+        if request.headers.get("content-type", "").partition(";")[0] != _JSON:
+            return _told(f"{_JSON} was expected.", 415)
+        body = await _body(request)
+        if body is None:
+            return _told("This request is too long.", 413)
+
+        def done() -> tuple[str, int]:
+            try:
+                content = json_content(body, "request")
+                if not isinstance(content, dict):
+                    raise InputError("request: a JSON object was expected.")
+                act(content)
+            except RefusedError as error:
+                return str(error), 409
+            except InputError as error:
+                return str(error), 400
+            return "", 200
+
+        message, status = await run_in_threadpool(done)
+        shown = await run_in_threadpool(desk.drawing)
+        return JSONResponse({**shown, "message": message}, status, _HEADERS)
 
     async def decide(request: Request) -> Response:
-        if (answer := refused(request)) is not None:
-            return answer
-        origin = request.headers.get("origin")
-        if origin is not None and origin != f"http://{request.headers['host']}":
-            return PlainTextResponse("This decision comes from another page.", 403, _HEADERS)
-        body = b""
-        async for chunk in request.stream():
-            body += chunk
-            if len(body) > _MOST_BYTES:
-                return PlainTextResponse("This decision is too long.", 413, _HEADERS)
+        body = await _body(request)
+        if body is None:
+            return _told("This decision is too long.", 413)
         fields = {key: values[-1].strip() for key, values in parse_qs(body.decode("utf-8", "replace")).items()}
-        message = _complaint(fields)
-        if message:
-            return page(message, 400)
-        before = read_review(run)
-        if result_sha256(run) != digest:
-            return page("Nothing was written: the result has changed since. Start the review again.", 409)
-        if fields.get("before", "") != ("" if before is None else before.time):
-            return page("Nothing was written: somebody has decided meanwhile, see above. Decide again.", 409)
+        if message := _complaint(fields):
+            return await page(message, 400)
         decision: Decision = "accepted" if fields["decision"] == "accepted" else "rejected"
         now = datetime.now(UTC).isoformat(timespec="microseconds")
-        write_review(run, Review(decision, fields.get("note", ""), fields["reviewer"], now, digest))
+        showed = fields.get("result", ""), fields.get("before", "")
+        try:
+            await run_in_threadpool(
+                desk.decide, decision, fields.get("note", ""), fields["reviewer"], now, showed[0], showed[1]
+            )
+        except RefusedError as error:
+            return await page(str(error), 409)
         return RedirectResponse(f"/{token}/", 303, _HEADERS)
 
     return Starlette(
         routes=[
-            Route("/{token}/", show),
-            Route("/{token}/report", show_report),
-            Route("/{token}/decision", decide, methods=["POST"]),
+            Route("/{token}/", guarded(show)),
+            Route("/{token}/report", guarded(show_report)),
+            Route("/{token}/state", guarded(state)),
+            Route("/{token}/drawing", guarded(drawing)),
+            Route("/{token}/change", guarded(change), methods=["POST"]),
+            Route("/{token}/start", guarded(start), methods=["POST"]),
+            Route("/{token}/cancel", guarded(cancel), methods=["POST"]),
+            Route("/{token}/decision", guarded(decide), methods=["POST"]),
         ],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=_HOSTS, www_redirect=False)],
     )
+
+
+def _told(words: str, status: int) -> Response:
+    return PlainTextResponse(words, status, _HEADERS)
+
+
+async def _body(request: Request) -> bytes | None:
+    """The body of a request, None if it is too long."""
+    body = b""
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > _MOST_BYTES:
+            return None
+    return body
 
 
 def _complaint(fields: dict[str, str]) -> str:

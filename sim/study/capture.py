@@ -41,8 +41,8 @@ _OF_TRUTH = "rotation"  # the sweep among whose runs are those from the truth, w
 AXIS_LABELS = {
     "rotation": "rotation, °",
     "depth": "depth, mm",
-    "lateral": "shift in the image plane, mm",
-    "jointly": "% of 30°, 100 mm and 40 mm",
+    "lateral": "shift in the image, mm",
+    "jointly": "% of all three",
 }
 
 

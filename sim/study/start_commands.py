@@ -13,7 +13,7 @@ from sim.study.trust import plan_trust, write_trust
 def capture_range(
     preset: str = "fast",
     first: int = 4,
-    starts: int = 24,
+    starts: int = 96,
     kind: Kind = "all",
     out: Path = OUT,
     patients: Path | None = None,

@@ -145,7 +145,7 @@ def write_images_and_case(folder: Path, known: Preoperative, images: list[ViewIm
         write_image(paths[ANATOMY_IMAGES], view.anatomy)
         write_image(paths[DEVICE_IMAGES], view.device)
         views.append(View(paths))
-    write_preview(folder / "preview.png", images)
+    write_preview(folder / "preview.png", images, known.case.carm.camera)
     write_case(folder, replace(known.case, views=tuple(views), truth=procedure.truth))
 
 

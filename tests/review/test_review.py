@@ -1,4 +1,4 @@
-"""The review of a run: who is let in, what is written and when not, and a server that is killed."""
+"""The server of a review: who is let in, what is written and when not, and a server that is killed."""
 
 import multiprocessing
 import re
@@ -9,75 +9,93 @@ from pathlib import Path
 
 import httpx
 import pytest
-import torch
 from starlette.testclient import TestClient
 
-from femoreg_torch.case import ObjectQuality, Result, read_result, result_content, write_json
+from femoreg_torch.case import Case, read_result, result_content, write_json
 from femoreg_torch.case.review import REVIEW_NAME, Review, read_review, result_sha256, write_review
+from femoreg_torch.commands.review import register_order
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import first_view_only
-from femoreg_torch.review import review_app, serve
-from femoreg_torch.review.server import LOOPBACK
+from femoreg_torch.registration import Scene
+from femoreg_torch.review import LOOPBACK, Desk, Order, review_app, serve
 
 TOKEN = "the-token"
 ACCEPT = {"decision": "accepted", "reviewer": "A. Surgeon", "note": "edges lie on the bone", "before": ""}
+DrawnScene = tuple[Case, Scene]
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
-    """A run with the result of one object."""
-    good = ObjectQuality((), 0.1, (0.1, 0.1), (0.1, 0.1, 0.1), (0.1, 0.1, 0.1), None, True, "all views agree")
-    pose = torch.eye(4, dtype=torch.float64)
-    write_json(tmp_path / "result.json", result_content(Result(first_view_only({"pelvis": pose}, 1), {"pelvis": good})))
-    return tmp_path
+def desk(drawn_scene: DrawnScene, order: Order, run: Path) -> Desk:
+    """Of a run with a result."""
+    assert run == order.out
+    return Desk(*drawn_scene, order, register_order)
 
 
-def client_of(run: Path, host: str = "127.0.0.1") -> TestClient:
-    app = review_app(run, read_result(run), "<p>the report</p>", result_sha256(run), TOKEN)
-    return TestClient(app, base_url=f"http://{host}:8123", follow_redirects=False)
+@pytest.fixture
+def client(desk: Desk) -> TestClient:
+    return client_of(desk)
 
 
-def test_the_page_shows_verdict_form_and_report_and_loads_nothing_else(run: Path) -> None:
-    client = client_of(run)
+def client_of(desk: Desk, host: str = "127.0.0.1") -> TestClient:
+    return TestClient(review_app(desk, TOKEN), base_url=f"http://{host}:8123", follow_redirects=False)
+
+
+def accepting(run: Path) -> dict[str, str]:
+    return {**ACCEPT, "result": result_sha256(run)}
+
+
+def test_the_page_shows_verdict_form_images_and_report_and_loads_nothing_else(client: TestClient) -> None:
     answer = client.get(f"/{TOKEN}/")
     assert answer.status_code == 200
-    assert "Trusted: every check of the registration passed." in answer.text
+    assert "Trusted" in answer.text
     assert "Nobody has reviewed this result." in answer.text
-    assert re.findall(r'(?:src|href|action)="([^"]*)"', answer.text) == ["data:,", "decision", "report"]
-    assert "default-src 'none'" in answer.headers["content-security-policy"]
-    assert client.get(f"/{TOKEN}/report").text == "<p>the report</p>"
+    loaded = re.findall(r'(?:src|href|action)="([^"]*)"', answer.text)
+    assert [address for address in loaded if not address.startswith("data:")] == ["decision", "report"]
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "connect-src 'self'" in policy
+    assert "unsafe-inline" not in policy.partition("script-src")[2].partition(";")[0]
+    report = client.get(f"/{TOKEN}/report")
+    assert "Registration of case" in report.text
+    assert report.headers["content-security-policy"] == "frame-ancestors 'self'"
 
 
-@pytest.mark.parametrize("address", ["/wrong/", "/wrong/report", "/", "/the-toke/", "//"])
-def test_without_the_token_nothing_is_shown(run: Path, address: str) -> None:
-    answer = client_of(run).get(address)
+@pytest.mark.parametrize(
+    "address", ["/wrong/", "/wrong/report", "/wrong/state", "/wrong/drawing", "/", "/the-toke/", "//"]
+)
+def test_without_the_token_nothing_is_shown(client: TestClient, address: str) -> None:
+    answer = client.get(address)
     assert answer.status_code in (403, 404)
-    assert "rusted" not in answer.text
-    assert "the report" not in answer.text
+    assert len(answer.text) < 100
 
 
-def test_without_the_token_nothing_is_written(run: Path) -> None:
-    assert client_of(run).post("/wrong/decision", data=ACCEPT).status_code == 403
+@pytest.mark.parametrize("what", ["decision", "change", "start", "cancel"])
+def test_without_the_token_nothing_is_done(client: TestClient, desk: Desk, run: Path, what: str) -> None:
+    assert client.post(f"/wrong/{what}", data=accepting(run)).status_code == 403
     assert not (run / REVIEW_NAME).exists()
+    assert desk.state()["revision"] == 0
 
 
-def test_another_host_name_is_refused(run: Path) -> None:
+def test_another_host_name_is_refused(desk: Desk, run: Path) -> None:
     """A web page that points a name of its own to 127.0.0.1 is a stranger."""
-    stranger = client_of(run, "evil.example")
+    stranger = client_of(desk, "evil.example")
     assert stranger.get(f"/{TOKEN}/").status_code == 400
-    assert stranger.post(f"/{TOKEN}/decision", data=ACCEPT).status_code == 400
+    assert stranger.post(f"/{TOKEN}/decision", data=accepting(run)).status_code == 400
     assert not (run / REVIEW_NAME).exists()
 
 
-def test_a_decision_from_another_page_is_refused(run: Path) -> None:
-    answer = client_of(run).post(f"/{TOKEN}/decision", data=ACCEPT, headers={"origin": "http://evil.example"})
-    assert answer.status_code == 403
+def test_what_comes_from_another_page_is_refused(client: TestClient, desk: Desk, run: Path) -> None:
+    evil = {"origin": "http://evil.example"}
+    assert client.post(f"/{TOKEN}/decision", data=accepting(run), headers=evil).status_code == 403
+    reset = {"revision": 0, "do": "reset"}
+    assert client.post(f"/{TOKEN}/change", json=reset, headers=evil).status_code == 403
+    text = {"content-type": "text/plain"}  # what a page elsewhere may send without asking first
+    assert client.post(f"/{TOKEN}/change", content='{"revision": 0, "do": "reset"}', headers=text).status_code == 415
     assert not (run / REVIEW_NAME).exists()
+    assert desk.state()["revision"] == 0
 
 
-def test_a_decision_is_written_and_shown(run: Path) -> None:
-    client = client_of(run)
-    answer = client.post(f"/{TOKEN}/decision", data=ACCEPT, headers={"origin": "http://127.0.0.1:8123"})
+def test_a_decision_is_written_and_shown(client: TestClient, run: Path) -> None:
+    answer = client.post(f"/{TOKEN}/decision", data=accepting(run), headers={"origin": "http://127.0.0.1:8123"})
     assert answer.status_code == 303
     found = read_review(run)
     assert found is not None
@@ -89,11 +107,10 @@ def test_a_decision_is_written_and_shown(run: Path) -> None:
     assert read_result(run).verdict.trusted
 
 
-def test_names_and_notes_stay_text(run: Path) -> None:
-    client = client_of(run)
-    client.post(f"/{TOKEN}/decision", data={**ACCEPT, "reviewer": "<script>alert(1)</script>", "note": "<b>x"})
+def test_names_and_notes_stay_text(client: TestClient, run: Path) -> None:
+    client.post(f"/{TOKEN}/decision", data={**accepting(run), "reviewer": "<script>alert(1)</script>", "note": "<b>x"})
     page = client.get(f"/{TOKEN}/").text
-    assert "<script" not in page
+    assert "<script>alert" not in page
     assert "&lt;b&gt;x" in page
 
 
@@ -105,22 +122,23 @@ def test_names_and_notes_stay_text(run: Path) -> None:
         ({"decision": "rejected", "note": ""}, "why you reject it"),
     ],
 )
-def test_an_incomplete_decision_is_not_written(run: Path, change: dict[str, str], says: str) -> None:
-    answer = client_of(run).post(f"/{TOKEN}/decision", data={**ACCEPT, **change})
+def test_an_incomplete_decision_is_not_written(
+    client: TestClient, run: Path, change: dict[str, str], says: str
+) -> None:
+    answer = client.post(f"/{TOKEN}/decision", data={**accepting(run), **change})
     assert answer.status_code == 400
     assert says in answer.text
     assert not (run / REVIEW_NAME).exists()
 
 
-def test_a_decision_that_is_too_long_is_refused(run: Path) -> None:
-    assert client_of(run).post(f"/{TOKEN}/decision", data={**ACCEPT, "note": "x" * 50_000}).status_code == 413
+def test_a_decision_that_is_too_long_is_refused(client: TestClient, run: Path) -> None:
+    assert client.post(f"/{TOKEN}/decision", data={**accepting(run), "note": "x" * 50_000}).status_code == 413
     assert not (run / REVIEW_NAME).exists()
 
 
-def test_of_two_tabs_the_second_is_told_of_the_first(run: Path) -> None:
-    client = client_of(run)
-    client.post(f"/{TOKEN}/decision", data=ACCEPT)
-    reject = {**ACCEPT, "decision": "rejected", "note": "the device is off"}
+def test_of_two_tabs_the_second_is_told_of_the_first(client: TestClient, run: Path) -> None:
+    client.post(f"/{TOKEN}/decision", data=accepting(run))
+    reject = {**accepting(run), "decision": "rejected", "note": "the device is off"}
     answer = client.post(f"/{TOKEN}/decision", data=reject)  # from a page that was loaded before
     assert answer.status_code == 409
     assert "somebody has decided meanwhile" in answer.text
@@ -133,17 +151,18 @@ def test_of_two_tabs_the_second_is_told_of_the_first(run: Path) -> None:
     assert second.decision == "rejected"
 
 
-def test_a_result_that_changed_is_not_decided_on(run: Path) -> None:
-    client = client_of(run)
+def test_a_result_that_changed_is_not_decided_on(client: TestClient, run: Path) -> None:
+    looked_at = accepting(run)
     write_json(run / "result.json", result_content(replace(read_result(run), seed=7)))
     assert "The result has changed" in client.get(f"/{TOKEN}/").text
-    assert client.post(f"/{TOKEN}/decision", data=ACCEPT).status_code == 409
+    assert client.post(f"/{TOKEN}/decision", data=looked_at).status_code == 409
+    assert client.post(f"/{TOKEN}/decision", data=accepting(run)).status_code == 409
     assert not (run / REVIEW_NAME).exists()
 
 
-def test_a_review_of_another_result_does_not_count(run: Path) -> None:
+def test_a_review_of_another_result_does_not_count(client: TestClient, run: Path) -> None:
     write_review(run, Review("accepted", "", "A. Surgeon", "2026-01-01T00:00:00+00:00", "0" * 64))
-    assert "does not count for this one" in client_of(run).get(f"/{TOKEN}/").text
+    assert "does not count for this one" in client.get(f"/{TOKEN}/").text
 
 
 @pytest.mark.parametrize(
@@ -161,11 +180,11 @@ def test_a_file_that_is_no_review_is_one_line(run: Path, content: str, says: str
         read_review(run)
 
 
-def test_a_server_that_is_killed_leaves_what_was_there(run: Path) -> None:
+def test_a_server_that_is_killed_leaves_what_was_there(desk: Desk, run: Path) -> None:
     """A real server dies in the middle of a decision that is being sent."""
     write_review(run, Review("rejected", "first", "A. Surgeon", "2026-01-01T00:00:00+00:00", result_sha256(run)))
     before = (run / REVIEW_NAME).read_bytes()
-    app = review_app(run, read_result(run), "", result_sha256(run), TOKEN)
+    app = review_app(desk, TOKEN)
     with socket.socket() as listening:
         listening.bind((LOOPBACK, 0))
         listening.listen()  # so that what comes before the server is ready waits for it
@@ -185,3 +204,56 @@ def test_a_server_that_is_killed_leaves_what_was_there(run: Path) -> None:
         server.join()
     assert (run / REVIEW_NAME).read_bytes() == before
     assert not [entry for entry in run.iterdir() if entry.name.startswith(".")]
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("[1]", "a JSON object was expected"),
+        ("{", "cannot be read as JSON"),
+        ('{"revision": 0}', "one of move, mark, unmark and do was expected"),
+        ('{"revision": 0, "do": "nonsense"}', "nonsense"),
+        ('{"revision": 0, "mark": {"name": "nose", "column": 1, "row": 1}}', "no landmark 'nose'"),
+        ('{"revision": 0, "mark": {"name": "FH-l", "column": 1e9, "row": 1}}', "column"),
+        ('{"revision": 0, "mark": {"name": "FH-l", "column": NaN, "row": 1}}', "NaN"),
+        ('{"revision": 0, "mark": {"name": "../../x", "column": 1, "row": 1}}', "no landmark"),
+        ('{"revision": 0, "move": {"what": "femur", "view": 0}}', "view 0 is not known"),
+        ('{"revision": 0, "move": {"what": "femur", "view": 1, "shift_px": [1]}}', "shift_px"),
+        ('{"revision": 0, "path": "/etc/passwd"}', "unknown key"),
+    ],
+)
+def test_a_change_that_makes_no_sense_is_told_and_changes_nothing(
+    client: TestClient, desk: Desk, content: str, says: str
+) -> None:
+    answer = client.post(f"/{TOKEN}/change", content=content, headers={"content-type": "application/json"})
+    assert answer.status_code == 400
+    assert says in answer.json()["message"]
+    assert desk.state()["revision"] == 0
+
+
+def test_a_request_that_is_too_long_is_refused(client: TestClient) -> None:
+    assert client.post(f"/{TOKEN}/change", json={"unmark": "x" * 50_000}).status_code == 413
+
+
+def test_a_change_on_a_page_that_is_behind_is_refused(client: TestClient) -> None:
+    """Of two tabs, the second shows what the first did before it changes anything itself."""
+    mark = {"revision": 0, "mark": {"name": "FH-l", "column": 5.0, "row": 6.0}}
+    assert client.post(f"/{TOKEN}/change", json=mark).status_code == 200
+    answer = client.post(f"/{TOKEN}/change", json={"revision": 0, "unmark": "FH-l"})
+    assert answer.status_code == 409
+    assert "Somebody changed this on another page" in answer.json()["message"]
+    assert answer.json()["drawing"]["landmarks"] == {"FH-l": [5.0, 6.0]}
+
+
+def test_too_few_landmarks_start_nothing(client: TestClient, run: Path) -> None:
+    answer = client.post(f"/{TOKEN}/start", json={"revision": 0, "source": "landmarks"})
+    assert answer.status_code == 400
+    assert "at least 4 are needed" in answer.json()["message"]
+    assert answer.json()["progress"] is None
+    assert sorted(path.name for path in run.parent.iterdir()) == ["run"]
+
+
+def test_there_is_nothing_to_cancel(client: TestClient) -> None:
+    answer = client.post(f"/{TOKEN}/cancel", json={})
+    assert answer.status_code == 409
+    assert "No registration is running" in answer.json()["message"]

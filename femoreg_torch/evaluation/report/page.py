@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -23,7 +24,8 @@ def report_page(case: Case, scene: Scene, result: Result, errors: dict[str, Any]
     """The report of a registration as the text of one HTML file.
 
     `errors` are those against the truth, None if there is none; `drawn` is the scene at the result's poses. Whatever
-    comes from files is escaped, and the page's policy lets the browser run its own scripts only and load nothing.
+    comes from files is escaped, and the page's policy lets the browser run its own scripts, show pictures that stand
+    within it, and load nothing.
     """
     environment = _environment()
     material = Material(case, scene, result, errors, drawn)
@@ -39,7 +41,7 @@ def report_page(case: Case, scene: Scene, result: Result, errors: dict[str, Any]
         sections=[section for section in made if section is not None],
         style=Markup(_source("report.css")),
         scripts=scripts,
-        policy=_policy(scripts),
+        policy=f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {script_hashes(scripts)}",
     )
 
 
@@ -61,8 +63,7 @@ def _source(name: str) -> str:
     return loader.get_source(environment, name)[0]
 
 
-def _policy(scripts: list[Markup]) -> str:
-    """The Content-Security-Policy: these scripts by their hashes, pictures within the page, and nothing else."""
+def script_hashes(scripts: Sequence[str]) -> str:
+    """These scripts as sources of a Content-Security-Policy, by their hashes, so that the browser runs no others."""
     digests = (hashlib.sha256(script.encode()).digest() for script in scripts)
-    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
-    return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {hashes}"
+    return " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)

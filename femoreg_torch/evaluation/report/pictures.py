@@ -60,7 +60,7 @@ def panels(case: Case, scene: Scene, poses: Poses, drawn: Drawn) -> list[Panel]:
             shown = [name for name in scene.shown(poses.camera1_from, kind) if (name, view) in drawn.integrals]
             marks = landmark_pixels(case, scene, poses, view, camera) if kind == scene.first_kind else ()
             layers = [
-                Layer(name, hexadecimal(colours[name]), _edge_uri(drawn.integrals[name, view], colours[name]))
+                Layer(name, hexadecimal(colours[name]), edge_uri(drawn.integrals[name, view], colours[name]))
                 for name in shown
             ]
             scale_px, scale_text = _scale(scene, case, poses, view, camera)
@@ -100,8 +100,8 @@ def _drr_uri(integrals: list[Tensor]) -> str:
     return jpeg_uri(np.repeat(grey[..., None], 3, axis=2))
 
 
-def _edge_uri(integral: Tensor, colour: Colour) -> str:
-    """Edges as a picture of one colour, transparent elsewhere."""
+def edge_uri(integral: Tensor, colour: Colour) -> str:
+    """The edges of line integrals (H, W) as a picture of one colour, transparent elsewhere: its data address."""
     edges = edges_of(integral).astype(np.uint8)
     picture = Image.fromarray(cv2.dilate(edges, np.ones((2, 2), np.uint8)), "P")
     picture.putpalette([*(0, 0, 0), *colour])
