@@ -96,13 +96,14 @@ def register_order(order: "Order", report: "Report", follow: "Follow") -> None:
     """Register as ordered, in a process that ends with the one that started it."""
     import torch
 
+    from femoreg_torch.case import read_case
     from femoreg_torch.commands.batch import end_with_parent
     from femoreg_torch.commands.register import register_into
 
     end_with_parent()
     register_into(
         order.out,
-        order.case,
+        read_case(order.case),
         order.preset,
         order.seed,
         weights=order.weights,

@@ -77,7 +77,7 @@ def opened(browser: Any, address: str) -> Any:
     page.set_default_timeout(SLOW_MS)
     page.asked, page.complaints = [], []
     page.on("request", lambda request: page.asked.append(request.url))
-    page.on("console", lambda message: page.complaints.append(message.text))
+    page.on("console", lambda message: None if "GL Driver" in message.text else page.complaints.append(message.text))
     page.on("pageerror", lambda error: page.complaints.append(str(error)))
     page.goto(address)
     page.locator("img.edges[src]").first.wait_for()
@@ -148,8 +148,8 @@ def test_landmarks_and_objects_are_dragged_registered_accepted_and_found_again(
     until(page, lambda found: found["revision"] == 11)
     before = middle(state(page))
     page.get_by_label("all objects").check()
-    drag(page, (48, 70), (54, 66))
-    until(page, lambda found: middle(found) == pytest.approx([before[0] + 6, before[1] - 4], abs=0.3))
+    drag(page, (48, 70), (50, 69))
+    until(page, lambda found: middle(found) == pytest.approx([before[0] + 2, before[1] - 1], abs=0.3))
     assert start_path(order.out).is_file()
 
     # the registration brings them back, while a second tab watches and can neither start another nor move anything
@@ -166,7 +166,7 @@ def test_landmarks_and_objects_are_dragged_registered_accepted_and_found_again(
     for tab in (page, second):  # both show the result by themselves
         tab.locator(".card.good, .card.bad").wait_for()
     found = read_result(order.out).poses.camera1_from["pelvis"]
-    assert float((found - true_pose)[:2, 3].norm()) < 4  # of 15 mm
+    assert float((found - true_pose)[:2, 3].norm()) < 2  # of 5 mm
     assert not landmarks_path(order.out).exists()
 
     page.get_by_label("Your name").fill("A. Surgeon")

@@ -41,7 +41,10 @@
     }
     return answer.json();
   };
-  const post = async (address, content) => {
+  // One after the other: each is sent with the revision that the one before has left.
+  let sent = Promise.resolve();
+  const post = (address, content) => (sent = sent.then(() => send(address, content)));
+  const send = async (address, content) => {
     const state = await ask(address, { ...content, revision: shown.revision });
     if (!state) return;
     show(state);
@@ -160,7 +163,7 @@
   // Objects: motions gather while the server draws the last one
 
   const nothing = () => ({ shift_px: [0, 0], turn_deg: 0, tilt_deg: [0, 0], depth_mm: 0 });
-  const send = async () => {
+  const sendMoves = async () => {
     if (busy) return;
     busy = true;
     while (waiting) {
@@ -180,7 +183,7 @@
     waiting.turn_deg += part.turn_deg || 0;
     waiting.depth_mm += part.depth_mm || 0;
     hint();
-    send();
+    sendMoves();
   };
   // Until the server has drawn it, the picture of the edges itself is moved.
   const hint = () => {
