@@ -46,9 +46,9 @@ docs: .venv/.docs
 	$(BIN)/sphinx-build -q -W --keep-going -c docs -d out/.doctrees . out/site
 	$(BIN)/python docs/site/check_site.py out/site
 
-# every block of code on the pages, the site, and a user's typed script (minutes)
+# every block of code on the pages, all notebooks at reduced size, the site, and a user's typed script (minutes)
 docs-test: .venv/.docs
-	$(BIN)/python -m pytest -m long tests/docs
+	$(BIN)/python -m pytest -m long tests/docs tests/notebooks
 
 # a wheel in dist/
 wheel: setup

@@ -29,7 +29,17 @@ include_patterns = [
     "CONTRIBUTING.md",
     "SECURITY.md",
 ]
-exclude_patterns = [".venv", ".git", "out", "tests", "configs", "docs/site", "notebooks/out", "**/.ipynb_checkpoints"]
+exclude_patterns = [
+    ".venv",
+    ".git",
+    "out",
+    "tests",
+    "configs",
+    "docs/site",
+    "docs/results/paper",
+    "notebooks/out",
+    "**/.ipynb_checkpoints",
+]
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "reference_directives"]
 myst_heading_anchors = 4

@@ -38,10 +38,16 @@ class Commands(FromCode):
     """Every command with the help that it prints."""
 
     def markdown(self) -> Iterator[str]:
-        """A heading and a help each."""
-        for command in entry_points(group=GROUP):
-            yield from (f"## femoreg {command.name}", "", "```text")
-            yield parser_of(command.load(), command.name).format_help().rstrip()
+        """A table of all, then a heading and a help each."""
+        commands = {command.name: command.load() for command in entry_points(group=GROUP)}
+        yield from ("| command | does |", "| --- | --- |")
+        for name, function in commands.items():
+            summary = (inspect.getdoc(function) or "").partition("\n\n")[0].replace("\n", " ")
+            yield f"| [`femoreg {name}`](#femoreg-{name}) | {_cell(summary.partition('. ')[0].rstrip('.'))} |"
+        yield ""
+        for name, function in commands.items():
+            yield from (f"## femoreg {name}", "", "```text")
+            yield parser_of(function, name).format_help().rstrip()
             yield from ("```", "")
 
 
