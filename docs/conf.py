@@ -11,6 +11,8 @@ DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS.parent), str(DOCS / "site")]
 os.environ["COLUMNS"] = "100"  # of the help of commands
 
+from sphinx.application import Sphinx  # noqa: E402
+
 import femoreg_torch  # noqa: E402
 
 project = "FemoReg Torch"
@@ -36,7 +38,6 @@ exclude_patterns = [
     "tests",
     "configs",
     "docs/site",
-    "docs/results/paper",
     "notebooks/out",
     "**/.ipynb_checkpoints",
 ]
@@ -64,3 +65,14 @@ html_show_sourcelink = False
 pygments_style = "friendly"
 # Nothing comes from outside: no widgets of notebooks, no fonts, no formulas by script.
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}
+
+
+def with_title(app: Sphinx, page: str, source: list[str]) -> None:
+    """Tables that `femoreg tables` wrote are parts of pages and have no title; on the site they are pages."""
+    if page.endswith("/tables") and not source[0].startswith("# "):
+        source[0] = f"# All tables\n\n{source[0]}"
+
+
+def setup(app: Sphinx) -> None:
+    """Called by Sphinx."""
+    app.connect("source-read", with_title)
