@@ -14,6 +14,7 @@ from page_blocks import ROOT
 
 CHECK = ROOT / "docs" / "site" / "check_site.py"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+PLAIN = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
 VISITED = ("index.html", "docs/concepts/frames-drawn.html", "docs/reference/api.html", "notebooks/own_parts.html")
 
 
@@ -70,7 +71,7 @@ def test_a_browser_asks_nobody_else(site: Path, address: str) -> None:
     playwright = pytest.importorskip("playwright.sync_api")
     asked: list[str] = []
     with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=PLAIN)
         page = browser.new_page()
         page.on("request", lambda request: asked.append(request.url))
         for place in VISITED:
