@@ -1,13 +1,16 @@
 """The public names are typed: mypy accepts a user's script, in strict mode, and refuses what is wrong in it."""
 
+import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from femoreg_torch import _PUBLIC
 
+ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = Path(__file__).resolve().parent / "users_script.py"
 WRONG = """
 result: int = femoreg.read_result(Path("run"))
@@ -19,11 +22,17 @@ femoreg.Level(pixel="3")
 def checked(script: Path, folder: Path) -> list[str]:
     """What mypy says of a script in a folder that holds nothing else."""
     settings = ["--strict", "--follow-imports=silent", "--no-error-summary", "--cache-dir", str(folder / "cache")]
-    ran = subprocess.run(
-        [sys.executable, "-m", "mypy", *settings, str(script)], cwd=folder, capture_output=True, encoding="utf-8"
-    )
+    command = [sys.executable, "-m", "mypy", *settings, str(script)]
+    where = os.environ | {"MYPYPATH": str(ROOT)}  # as an editable install is not seen by mypy
+    ran = subprocess.run(command, cwd=folder, env=where, capture_output=True, encoding="utf-8")
     assert not ran.stderr, ran.stderr
     return ran.stdout.splitlines()
+
+
+def test_an_installed_package_says_that_it_is_typed() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert project["tool"]["setuptools"]["package-data"]["femoreg_torch"] == ["py.typed"]
+    assert (ROOT / "femoreg_torch" / "py.typed").is_file()
 
 
 def test_names_are_told_to_type_checkers_as_well() -> None:
