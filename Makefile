@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: setup demo test fuzz soak audit lint notebooks bench bench-gpu accuracy capture-range trust ablation plans
+.PHONY: setup demo test fuzz soak audit lint notebooks docs docs-test wheel bench bench-gpu accuracy capture-range trust ablation plans
 
 setup: .venv/.installed
 
@@ -40,6 +40,23 @@ lint: setup
 # executes all notebooks in place, at full size
 notebooks: setup
 	$(BIN)/python notebooks/execute.py
+
+.venv/.docs: .venv/.installed
+	$(BIN)/python -m pip install --quiet --editable '.[docs]' --constraint constraints.txt
+	touch $@
+
+# the documentation site: open out/site/index.html
+docs: .venv/.docs
+	$(BIN)/sphinx-build -q -W --keep-going -c docs -d out/.doctrees . out/site
+	$(BIN)/python docs/site/check_site.py out/site
+
+# every block of code on the pages, all notebooks at reduced size, the site, and a user's typed script (minutes)
+docs-test: .venv/.docs
+	$(BIN)/python -m pytest -m long tests/docs tests/notebooks
+
+# a wheel in dist/
+wheel: setup
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 
 bench: setup
 	$(BIN)/python benchmarks/drr.py

@@ -16,12 +16,15 @@ from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 
 import femoreg_torch
 from femoreg_torch.commands.status import BAD_INPUT, DONE, INTERRUPTED
 from femoreg_torch.errors import InputError, defect_in_one_line, shortened
 from femoreg_torch.extras import missing_extra
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser
 
 GROUP = "femoreg_torch.commands"
 _LONGEST = 2000  # characters of a complaint
@@ -130,12 +133,11 @@ def _run(command: EntryPoint, arguments: list[str]) -> int:
     return DONE if status is None else int(status)
 
 
-def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dict[str, Any]:
-    """Keyword arguments for `function`. Raises `InputError` for what does not fit its signature."""
+def parser_of(function: Callable[..., Any], name: str) -> "ArgumentParser":
+    """The parser of a command's arguments, made from its signature and docstring."""
     from docstring_parser import parse as parse_docstring
-    from jsonargparse import ArgumentError
 
-    from femoreg_torch.settings import plain_parser, told
+    from femoreg_torch.settings import plain_parser
 
     text = parse_docstring(function.__doc__ or "")
     help_of = {parameter.arg_name: parameter.description for parameter in text.params}
@@ -148,6 +150,16 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
         flags, settings = _argument(parameter, hints[parameter.name])
         flags += getattr(annotated[parameter.name], "__metadata__", ())  # short forms, as in Annotated[int, "-n"]
         parser.add_argument(*flags, **settings, help=help_of.get(parameter.name))
+    return parser
+
+
+def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dict[str, Any]:
+    """Keyword arguments for `function`. Raises `InputError` for what does not fit its signature."""
+    from jsonargparse import ArgumentError
+
+    from femoreg_torch.settings import told
+
+    parser = parser_of(function, name)
     try:
         values = parser.instantiate(parser.parse_args(arguments))
     except (ArgumentError, TypeError, ValueError, OSError) as error:  # OSError: a file of options that cannot be read
@@ -155,7 +167,7 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
     for key, (low, high) in _RANGES.items():
         if isinstance(value := values.get(key), int | float) and not low <= value <= high:
             raise InputError(f"{name}: --{key.replace('_', '-')}: {low:g} to {high:g} was expected, found {value:g}.")
-    return {key: values[key] for key in hints if key != "return"}
+    return {key: values[key] for key in get_type_hints(function) if key != "return"}
 
 
 def _argument(parameter: inspect.Parameter, hint: Any) -> tuple[list[str], dict[str, Any]]:

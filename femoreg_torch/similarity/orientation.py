@@ -13,7 +13,7 @@ from femoreg_torch.similarity.kernels import away_from, derivative_taps, image_g
 
 @dataclass(frozen=True)
 class GradientOrientation:
-    """Mean of (2 − ln(|Δθ| + 1)) / 2 over the pixels whose gradient is above the fixed image's median.
+    """Mean of `(2 − ln(|Δθ| + 1)) / 2` over the pixels whose gradient is above the fixed image's median.
 
     Nothing where it is not above the median in the moving image. De Silva et al., 3D–2D image registration for target
     localization in spine surgery, Phys. Med. Biol. 61 (2016) 3009.

@@ -1,0 +1,104 @@
+"""The code on the pages runs, and the commands that they show are commands as they are."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import pytest
+from page_blocks import ROOT, Block, blocks_of, pages
+
+from femoreg_torch.commands.main import GROUP, parser_of
+from femoreg_torch.errors import InputError
+from femoreg_torch.text import yaml_content
+
+SHELL, PYTHON = ("sh", "bash"), "python"
+LANGUAGES = (*SHELL, PYTHON, "yaml", "toml", "text", "json", "")
+BLOCKS = [block for page in pages() for block in blocks_of(page)]
+USUAL = [page for page in pages() if any(b.language == PYTHON and b.mark is None for b in blocks_of(page))]
+APART = [page for page in pages() if any(b.mark == "run apart" for b in blocks_of(page))]
+
+
+def run_python(block: Block, names: dict[str, Any]) -> None:
+    """Run a block among the names of the blocks before it; a failure tells page and line."""
+    exec(compile("\n" * block.line + block.code, block.page, "exec"), names)
+
+
+def shell_lines(block: Block) -> list[str]:
+    """The commands of a block, one each, without the brackets around what may be left out."""
+    code = re.sub(r"\[(--[^\]]+)\]", r"\1", block.code.replace("\\\n", " "))
+    return [line.strip() for line in code.splitlines()]
+
+
+def femoreg_arguments() -> list[tuple[str, list[str]]]:
+    """Place and arguments of every `femoreg` command in a block of the pages."""
+    shown = [block for block in BLOCKS if block.language in (*SHELL, "text", "")]
+    lines = [(block.place, line) for block in shown for line in shell_lines(block)]
+    found = [(place, shlex.split(line, comments=True)) for place, line in lines if line.startswith("femoreg ")]
+    return [(place, words[1:]) for place, words in found]
+
+
+def test_every_block_says_what_it_is() -> None:
+    assert not [
+        block.place for block in BLOCKS if block.language.split(" ")[0] not in LANGUAGES and block.language[:1] != "{"
+    ]
+
+
+def test_every_block_of_a_shell_is_run_or_says_why_not() -> None:
+    assert not [block.place for block in BLOCKS if block.language in SHELL and block.mark is None]
+
+
+def test_the_commands_on_the_pages_are_as_the_parsers_have_them() -> None:
+    commands = {command.name: command for command in entry_points(group=GROUP)}
+    shown = femoreg_arguments()
+    assert len(shown) > 20
+    for place, (name, *arguments) in shown:
+        assert name in commands, place
+        parser = parser_of(commands[name].load(), name)
+        try:
+            parser.parse_args(arguments)
+        except Exception as error:
+            pytest.fail(f"{place}: femoreg {name}: {error}")
+
+
+def test_yaml_on_the_pages_can_be_read() -> None:
+    whole = [block for block in BLOCKS if block.language == "yaml" and "…" not in block.code]
+    assert len(whole) > 5
+    for block in whole:
+        try:
+            yaml_content(block.code, block.place)
+        except InputError as error:
+            pytest.fail(str(error))
+
+
+@pytest.mark.parametrize("page", USUAL)
+def test_python_on_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"__name__": "page"}
+    monkeypatch.setitem(sys.modules, "page", type(sys)("page"))  # dataclasses look their module up
+    for block in blocks_of(page):
+        if block.language == PYTHON and block.mark is None:
+            run_python(block, names)
+
+
+@pytest.mark.long
+def test_what_is_run_apart_runs_from_the_first_page_to_the_last(tmp_path: Path) -> None:
+    """In one folder, each block in a process of its own, as a reader would who takes one page after the other."""
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    apart = [block for page in APART for block in blocks_of(page) if block.mark == "run apart"]
+    assert len(apart) > 8
+    for block in apart:
+        shell = ["bash", "-e", "-u", "-c", block.code]
+        command = shell if block.language in SHELL else [sys.executable, "-c", block.code]
+        ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, encoding="utf-8")
+        assert ran.returncode == 0, (
+            f"{block.place}: status {ran.returncode}\n{ran.stdout[-2000:]}\n{ran.stderr[-2000:]}"
+        )
+
+
+def test_a_mark_without_a_reason_is_none() -> None:
+    assert not re.search(r"<!-- (run apart|not run)(?!: .{5,} -->)", "".join((ROOT / p).read_text() for p in pages()))
