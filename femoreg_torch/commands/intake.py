@@ -32,7 +32,7 @@ def inspect(path: Path, *, out: Path = Path("inspect.png"), series: str | None =
     for warning in found.warnings:
         console.print(f"[yellow]Warning:[/] {escape(warning)}.", highlight=False)
     if found.picture is not None:
-        _write_picture(out, found.picture)
+        write_picture(out, found.picture)
         console.print(f"Picture: {escape(str(out))}")
 
 
@@ -65,7 +65,7 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     for number, problem in enumerate(found.problems, 1):
         console.print(f"[bold red]{number}.[/] {escape(problem)}", highlight=False)
     if found.picture is not None:
-        _write_picture(out, found.picture)
+        write_picture(out, found.picture)
         console.print(f"Picture: {escape(str(out))}")
     if found.problems:
         count = len(found.problems)
@@ -75,7 +75,7 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     return DONE
 
 
-def _write_picture(path: Path, picture: "Picture") -> None:
+def write_picture(path: Path, picture: "Picture") -> None:
     import cv2
 
     from femoreg_torch.errors import InputError
@@ -110,6 +110,7 @@ def new_case(
     device_images: tuple[Path, ...] = (),
     carm: str | None = None,
     intensity: Literal["raw", "log"] = "raw",
+    segment: bool = False,
 ) -> None:
     """Make a case folder of a CT, a segmentation, landmarks, a plan, a device and fluoroscopic images.
 
@@ -142,6 +143,8 @@ def new_case(
         device_images: Images with the device, in the same order; or a folder of them.
         carm: C-arm: a preset (cios_fusion) or a YAML file; by default what the tags of the first DICOM image say.
         intensity: raw (bone dark) or log (attenuation, bone bright).
+        segment: Find the bones in the CT if --labels is not given, and propose landmarks if --landmarks is not; see
+            `femoreg segment` and `femoreg landmarks`.
     """
     import sys
 
@@ -172,6 +175,7 @@ def new_case(
         device_images=tuple(device_images),
         carm=carm,
         intensity=intensity,
+        segment=segment,
     )
     console = Console(soft_wrap=True)
     if sys.stdin.isatty():

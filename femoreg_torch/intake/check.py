@@ -44,7 +44,7 @@ from femoreg_torch.fluoro import Display, check_matches, read_image
 from femoreg_torch.geometry import CArm
 from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.start_picture import picture_of_start
-from femoreg_torch.intake.volumes import ct_warnings, cut_bones, described, nifti_warnings
+from femoreg_torch.intake.volumes import ct_warnings, described, nifti_warnings
 from femoreg_torch.pnp import MINIMUM
 from femoreg_torch.registration.models import model_attenuation
 from femoreg_torch.volume import (
@@ -59,6 +59,7 @@ from femoreg_torch.volume import (
     swapped_sides,
 )
 from femoreg_torch.volume.bones import nearest_label
+from femoreg_torch.volume.borders import cut_bones
 
 _T = TypeVar("_T")
 _ANY_PATH = PlannedPath(FEMUR, torch.zeros(3).double(), torch.ones(3).double())
@@ -188,7 +189,9 @@ def _check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: _Found)
     path = found.attempt(lambda: ct.file_path("image", folder, may_be_folder=True))
     labels_path = None
     if "labels" not in ct:
-        found.problem(f"{ct.where('labels')}: is missing, a label map of the bones was expected.")
+        found.problem(
+            f"{ct.where('labels')}: is missing, a label map of the bones was expected. `femoreg segment` makes one."
+        )
     else:
         labels_path = found.attempt(lambda: ct.file_path("labels", folder, may_be_folder=True))
     table = found.attempt(lambda: read_bones(ct, folder, HIP)) if labels_path is not None else None
