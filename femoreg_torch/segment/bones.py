@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
@@ -19,8 +20,8 @@ _LEAST_CONFIDENCE = 0.6  # below it, what was labelled is taken for another part
 _DOUBTED = 0.85  # mean share of a bone below which a warning is given
 _CLOSED_MM2 = 150.0  # of contact between femur and hip bone; a head has some 5000 mm² in its socket
 _METAL_ML = 0.5
-_WING_VOXELS = 8  # of a slice through a hip bone, on the network's voxels; fewer are a stray speck
-_SIDE_SHARE = 0.8  # of a part that has this much of one side, all is of that side
+_MAIN_PART = 0.3  # of the largest part of the hip bones; smaller ones may be stray specks
+_SIDE_SHARE = {"femur": 0.8, "hip": 0.97}  # a part with so much of one side is all of it; hip bones may meet
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +77,6 @@ def _confidence(shares: Tensor, number: int) -> float:
 
 def _sides_told_apart(shares: Tensor, network: BoneNetwork) -> Tensor:
     """The shares, with each connected femur, or hip bone that is mostly of one side, wholly of that side."""
-    from scipy import ndimage
-
     names = network.anatomy.bone_names
     coarse = shares.argmax(0).numpy()
     result = shares.clone()
@@ -87,7 +86,7 @@ def _sides_told_apart(shares: Tensor, network: BoneNetwork) -> Tensor:
         for part in range(1, count + 1):
             inside = parts == part
             share = float((coarse[inside] == left).mean())
-            if 0 < share < 1 and max(share, 1 - share) >= _SIDE_SHARE:
+            if 0 < share < 1 and max(share, 1 - share) >= _SIDE_SHARE[bone]:
                 keep, drop = (left, right) if share > 0.5 else (right, left)
                 near = torch.from_numpy(ndimage.binary_dilation(inside))
                 result[keep][near] += result[drop][near]
@@ -101,12 +100,15 @@ def _spine_apart(shares: Tensor, network: BoneNetwork) -> Tensor:
     No crop that the network learned from reaches far above the pelvis, and there it takes vertebrae for shafts.
     """
     names = network.anatomy.bone_names
-    coarse = shares.argmax(0)
+    coarse = shares.argmax(0).numpy()
     hips = (coarse == 1 + names.index("hip_left")) | (coarse == 1 + names.index("hip_right"))
-    slices = torch.nonzero(hips.sum((1, 2)) >= _WING_VOXELS)
-    if not len(slices):
+    parts, count = ndimage.label(hips)
+    if not count:
         return shares
-    top = 1 + int(slices.max())
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    main = (sizes > _MAIN_PART * sizes.max())[parts]
+    top = 1 + int(np.flatnonzero(main.any((1, 2))).max())
     result = shares.clone()
     for side in ("left", "right"):
         femur = 1 + names.index(f"femur_{side}")
