@@ -63,8 +63,9 @@ class VolumeUNet(nn.Module):
         self.narrow = nn.ModuleList(nn.Conv3d(b, a, 1, bias=False) for a, b in pairwise(widths))
         self.decoder = nn.ModuleList(_convolution(2 * a, a) for a in widths[:-1])
         self.head = nn.Conv3d(widths[0], settings.classes * _BLOCK**3, 1)
-        with torch.no_grad():  # at the start nearly everything is background, as it will be
-            self.head.bias[: _BLOCK**3] += 3.0
+        bias = torch.zeros(settings.classes, _BLOCK**3)
+        bias[0] = 3.0  # at the start nearly everything is background, as it will be
+        self.head.bias = nn.Parameter(bias.flatten())
 
     def forward(self, volume: Tensor) -> Tensor:
         features = _blocks_to_channels(volume)

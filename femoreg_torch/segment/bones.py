@@ -16,12 +16,12 @@ from femoreg_torch.volume.borders import cut_bones
 _BONE_HU, _METAL_HU = 200.0, 2800.0
 _LEAST_HIP_ML = 15.0  # of a hip bone; whole ones of adults have 180 to 400
 _LEAST_FEMUR_ML = 10.0
-_LEAST_CONFIDENCE = 0.6  # below it, what was labelled is taken for another part of the body
+_LEAST_CONFIDENCE = 0.6  # mean probability of a bone; with less it is left out
 _DOUBTED = 0.85  # mean share of a bone below which a warning is given
 _CLOSED_MM2 = 150.0  # of contact between femur and hip bone; a head has some 5000 mm² in its socket
 _METAL_ML = 0.5
 _MAIN_PART = 0.3  # of the largest part of the hip bones; smaller ones may be stray specks
-_SIDE_SHARE = {"femur": 0.8, "hip": 0.97}  # a part with so much of one side is all of it; hip bones may meet
+_SIDE_SHARE = {"femur": 0.6, "hip": 0.97}  # a part with so much of one side is all of it; hip bones may meet
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +49,11 @@ def segment_bones(ct: Volume, network: BoneNetwork, refine: bool = True) -> Segm
     shares = _spine_apart(_sides_told_apart(shares, network), network)
     anatomy = network.anatomy
     data = refined_labels(ct, shares, grid, anatomy) if refine else unrefined_labels(ct, shares, grid)
-    labels = Volume(data, ct.lps_from_index)
     counts = torch.bincount(data.flatten(), minlength=1 + len(anatomy.bones)).tolist()
     voxel_ml = float(np.prod(ct.spacing_mm)) / 1000
     volume_ml = {name: n * voxel_ml for name, n in zip(anatomy.bone_names, counts[1:], strict=True) if n}
     confidence = {name: _confidence(shares, 1 + anatomy.bone_names.index(name)) for name in volume_ml}
+    doubtful = [name for name, share in confidence.items() if share < _LEAST_CONFIDENCE]
     hips = [side for side in ("left", "right") if _is_there(volume_ml, confidence, f"hip_{side}", _LEAST_HIP_ML)]
     femora = [side for side in ("left", "right") if _is_there(volume_ml, confidence, f"femur_{side}", _LEAST_FEMUR_ML)]
     if not hips or not femora:
@@ -62,7 +62,13 @@ def segment_bones(ct: Volume, network: BoneNetwork, refine: bool = True) -> Segm
             f"segment: no {lacking} was found in {bright_ml:.0f} ml of bone. A CT of the hip was expected: is it of "
             "another part of the body, or turned against what its header says?"
         )
-    warnings = _warnings(ct, labels, network, volume_ml, confidence, hips)
+    left_out = []
+    for name in doubtful:
+        data[data == 1 + anatomy.bone_names.index(name)] = 0
+        told = f"{volume_ml.pop(name):.0f} ml, mean probability {confidence.pop(name):.2f}"
+        left_out.append(f"what may be {name} ({told}) was left out: the network is not sure")
+    labels = Volume(data, ct.lps_from_index)
+    warnings = left_out + _warnings(ct, labels, network, volume_ml, confidence, hips)
     return Segmentation(labels, confidence, volume_ml, tuple(warnings))
 
 

@@ -234,7 +234,7 @@ def _learn_from(
 ) -> float:
     loss = segmentation_loss(_forward(network, scan.hu, multiple), scan.labels[None].long(), background)
     optimiser.zero_grad()
-    loss.backward()  # type: ignore[no-untyped-call]
+    loss.backward()
     nn.utils.clip_grad_norm_(network.parameters(), 1.0)
     optimiser.step()
     return loss.item()

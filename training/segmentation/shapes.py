@@ -84,7 +84,7 @@ def cached_shapes(paths: list[Path], cache: Path) -> list[BoneShape]:
     """The shapes of these files, from `cache` where it has them; vertebrae are lent by the first that has some."""
     cache.mkdir(parents=True, exist_ok=True)
     spines: list[BoneShape] = []
-    shapes = []
+    shapes: list[BoneShape] = []
     for path in sorted(paths, key=lambda path: "pelvic_ref" not in path.name):
         kept = cache / f"{path.name.split('.')[0]}.npz"
         if not kept.is_file():
@@ -213,7 +213,7 @@ def _lent_spine(spine: BoneShape, fields: Mapping[str, NDArray[np.float32]], fir
     return np.asarray(lent, np.float32)
 
 
-def _upper_end(field: NDArray[np.float32]) -> Points:
+def _upper_end(field: NDArray[np.floating]) -> Points:
     """Index (3,) of the middle of a sacrum's uppermost centimetre, near its middle from left to right."""
     points = np.argwhere(field < 0)[:, ::-1].astype(float)
     middle = points[np.abs(points[:, 0] - np.median(points[:, 0])) < 15 / STEP_MM]
