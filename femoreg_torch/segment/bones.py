@@ -48,7 +48,7 @@ def segment_bones(ct: Volume, network: BoneNetwork, refine: bool = True) -> Segm
     shares, grid = bone_shares(network, ct)
     shares = _spine_apart(_sides_told_apart(shares, network), network)
     anatomy = network.anatomy
-    data = refined_labels(ct, shares, grid, anatomy) if refine else unrefined_labels(ct, shares, grid)
+    data = refined_labels(ct, shares, grid, anatomy) if refine else unrefined_labels(ct, shares, grid, anatomy)
     counts = torch.bincount(data.flatten(), minlength=1 + len(anatomy.bones)).tolist()
     voxel_ml = float(np.prod(ct.spacing_mm)) / 1000
     volume_ml = {name: n * voxel_ml for name, n in zip(anatomy.bone_names, counts[1:], strict=True) if n}

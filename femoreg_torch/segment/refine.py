@@ -28,6 +28,7 @@ _LOWEST_EDGE_HU, _HIGHEST_EDGE_HU = 130.0, 300.0
 _NEAR_MM = 3.0
 _SOFTNESS_HU = 100.0  # over which the CT's word goes from "surely not" to "surely"
 _CT_WEIGHT = 0.35  # of the CT's word against the network's share: 0.15 to 0.85 is the band where the CT decides
+_JOINT_WEIGHT = 1.5  # where hip bone and femur are equally likely lies the joint space, and the CT decides
 _METAL_HU, _METAL_MM = 2300.0, 3.0  # in metal and so far around it the network decides alone
 _CLOSE_MM = 2.0  # gaps so wide within a bone are marrow, where the network agrees
 _CLOSED_SHARE = 0.4
@@ -54,22 +55,22 @@ def refined_labels(ct: Volume, shares: Tensor, grid: Volume, anatomy: Anatomy) -
     if not bool((coarse > 0).any()):
         return labels
     region = _region(ct, coarse > 0, grid)
-    bone, which = _on_region(shares, region, ct, grid)
-    found = torch.where(_is_bone(bone, region), which, 0).numpy()
+    bone, which, joint = _on_region(shares, region, ct, grid, anatomy)
+    found = torch.where(_is_bone(bone - _JOINT_WEIGHT * joint, region), which, 0).numpy()
     for number in range(1, shares.shape[0]):
         found = _whole(found, number, bone.numpy(), region.spacing)
     found = opened_joints(found, region.hu.numpy(), anatomy)
     return _onto(labels, torch.from_numpy(found), region)
 
 
-def unrefined_labels(ct: Volume, shares: Tensor, grid: Volume) -> Tensor:
+def unrefined_labels(ct: Volume, shares: Tensor, grid: Volume, anatomy: Anatomy) -> Tensor:
     """As `refined_labels`, from the network alone: the most probable class at each voxel."""
     labels = torch.zeros(ct.data.shape, dtype=torch.uint8)
     coarse = shares.argmax(0)
     if not bool((coarse > 0).any()):
         return labels
     region = _region(ct, coarse > 0, grid)
-    bone, which = _on_region(shares, region, ct, grid)
+    bone, which, _ = _on_region(shares, region, ct, grid, anatomy)
     return _onto(labels, torch.where(bone > 0.5, which, 0).to(torch.uint8), region)
 
 
@@ -97,8 +98,12 @@ def _averaged(values: Tensor, axis: int, count: int) -> Tensor:
     return shorter.reshape(*moved.shape[:-1], count).movedim(-1, axis)
 
 
-def _on_region(shares: Tensor, region: _Region, ct: Volume, grid: Volume) -> tuple[Tensor, Tensor]:
-    """Share of all bones together and the number of the most probable one (Z, Y, X), by linear interpolation."""
+def _on_region(
+    shares: Tensor, region: _Region, ct: Volume, grid: Volume, anatomy: Anatomy
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Share of all bones together, the number of the most probable one, and the lesser one of the shares of hip bones
+    and femora; each (Z, Y, X), by linear interpolation.
+    """
     ratio = np.array(ct.spacing_mm) / np.array(grid.spacing_mm)
     places = []
     for axis, count in enumerate(reversed(region.hu.shape)):
@@ -107,6 +112,7 @@ def _on_region(shares: Tensor, region: _Region, ct: Volume, grid: Volume) -> tup
     best = torch.zeros(region.hu.shape)
     which = torch.ones(region.hu.shape, dtype=torch.uint8)
     total = torch.zeros(region.hu.shape)
+    sides = {"hip": torch.zeros(region.hu.shape), "femur": torch.zeros(region.hu.shape)}
     for number in range(1, shares.shape[0]):
         if float(shares[number].max()) < 0.05:
             continue
@@ -116,7 +122,10 @@ def _on_region(shares: Tensor, region: _Region, ct: Volume, grid: Volume) -> tup
         total += values
         which[values > best] = number
         best = torch.maximum(best, values)
-    return total, which
+        kind = anatomy.bone_names[number - 1].partition("_")[0]
+        if kind in sides:
+            sides[kind] = torch.maximum(sides[kind], values)
+    return total, which, torch.minimum(sides["hip"], sides["femur"])
 
 
 def _linear(values: Tensor, places: Tensor, axis: int) -> Tensor:

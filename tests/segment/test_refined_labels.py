@@ -17,7 +17,7 @@ from femoreg_torch.volume import Volume, resample_isotropic
 def test_edges_are_those_of_the_ct(spacing: tuple[float, float, float]) -> None:
     ct, truth = hip_scene(spacing)
     shares, grid = shares_of(truth, spacing), resample_isotropic(ct, 3.0)
-    found, coarse = refined_labels(ct, shares, grid, HIP), unrefined_labels(ct, shares, grid)
+    found, coarse = refined_labels(ct, shares, grid, HIP), unrefined_labels(ct, shares, grid, HIP)
     for bone in (HIP_LEFT, FEMUR_LEFT):
         assert dice(found, truth, bone) > 0.95
         assert dice(found, truth, bone) > dice(coarse, truth, bone) - 0.01
