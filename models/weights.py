@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 SHIPPED_WEIGHTS = "hip14.safetensors"
+SHIPPED_BONES = "bones6.safetensors"  # of the network that labels bones in a CT
 
 # What files without `kind` call their network: its kind, and the settings that it has.
 _ARCHITECTURES = {
@@ -54,8 +55,7 @@ def read_weights(path: Path | None = None) -> Weights:
     Raises `FileNotFoundError` if there is no such file and `ValueError` if it holds something else.
     """
     if path is None:
-        with as_file(files("models").joinpath("weights", SHIPPED_WEIGHTS)) as shipped:
-            return read_weights(shipped)
+        return shipped_weights(SHIPPED_WEIGHTS)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file. Give a weights file (safetensors) that `femoreg train` wrote.")
     try:
@@ -74,6 +74,12 @@ def read_weights(path: Path | None = None) -> Weights:
             f"{path}: its metadata does not say the kind and the settings of a network (at {error}), so these are no "
             "weights that `femoreg train` wrote."
         ) from error
+
+
+def shipped_weights(name: str) -> Weights:
+    """The content of a weights file that is installed with this package. Raises as `read_weights`."""
+    with as_file(files("models").joinpath("weights", name)) as shipped:
+        return read_weights(shipped)
 
 
 def _without_kind(config: dict[str, Any], state: dict[str, Tensor]) -> Weights:

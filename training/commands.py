@@ -95,3 +95,40 @@ def measure(
         changed = (alter(image) for path in images for image in images_of_file(path))
         counted[name] = outcomes(read_images(network, changed))
     Console().print(write_accuracy(out, readings, counted), highlight=False)
+
+
+def train_segmentation(
+    settings: str,
+    *,
+    shapes: list[Path],
+    out: Path,
+    cache: Path | None = None,
+    resume: bool = False,
+) -> None:
+    """Train the network that labels bones in a CT, on random CTs around bone shapes, and export its weights.
+
+    OUT holds progress.csv (loss, and Dice on the shapes that are held out), checkpoint.pt and bones6.safetensors,
+    written every so many steps: a run that was killed goes on with `--resume`.
+
+    Args:
+        settings: preset in configs/segmentation (bones6), or a YAML file, which may extend one.
+        shapes: label maps (NIfTI, of Pelvic-Ref or with the ids of the table `autoseg`) and surfaces (.npz).
+        out: folder of this run.
+        cache: folder of the shapes' distance fields, to share between runs; by default OUT/shapes.
+        resume: continue from the checkpoint in OUT.
+    """
+    from rich.console import Console
+
+    from training.segmentation.learn import read_segmentation_settings
+    from training.segmentation.learn import train_segmentation as train
+
+    console = Console(soft_wrap=True)
+    path = train(
+        read_segmentation_settings(settings),
+        shapes,
+        out,
+        cache or out / "shapes",
+        resume,
+        lambda text: console.print(text, highlight=False, markup=False),
+    )
+    console.print(f"Weights written to {path}", markup=False)

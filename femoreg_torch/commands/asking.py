@@ -14,7 +14,7 @@ from femoreg_torch.volume import has_names
 
 _QUESTIONS = {
     "ct": "CT: DICOM folder or file",
-    "labels": "Segmentation: label map, .seg.nrrd, folder of masks or DICOM SEG",
+    "labels": "Segmentation: label map, .seg.nrrd, folder of masks or DICOM SEG (--segment finds the bones)",
     "landmarks": "Landmarks of the CT (.mrk.json, .fcsv, .json)",
     "plan": "Planned path: a line or points of 3D Slicer",
     "device": "CAD model of the device (empty: none)",
@@ -28,6 +28,8 @@ _MAY_BE_EMPTY = ("device", "device_images")
 def ask_for_missing(given: NewCase, console: Console) -> NewCase:
     """What was given, with answers for the rest. An empty answer leaves out what may be left out."""
     for name, question in _QUESTIONS.items():
+        if given.segment and name in ("labels", "landmarks"):
+            continue
         if getattr(given, name) or (name in ("device_points", "device_images") and given.device is None):
             continue
         answer = _answer(question, console, name in _MAY_BE_EMPTY)

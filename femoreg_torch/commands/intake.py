@@ -32,7 +32,7 @@ def inspect(path: Path, *, out: Path = Path("inspect.png"), series: str | None =
     for warning in found.warnings:
         console.print(f"[yellow]Warning:[/] {escape(warning)}.", highlight=False)
     if found.picture is not None:
-        _write_picture(out, found.picture)
+        write_picture(out, found.picture)
         console.print(f"Picture: {escape(str(out))}")
 
 
@@ -65,7 +65,7 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     for number, problem in enumerate(found.problems, 1):
         console.print(f"[bold red]{number}.[/] {escape(problem)}", highlight=False)
     if found.picture is not None:
-        _write_picture(out, found.picture)
+        write_picture(out, found.picture)
         console.print(f"Picture: {escape(str(out))}")
     if found.problems:
         count = len(found.problems)
@@ -75,7 +75,7 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     return DONE
 
 
-def _write_picture(path: Path, picture: "Picture") -> None:
+def write_picture(path: Path, picture: "Picture") -> None:
     import cv2
 
     from femoreg_torch.errors import InputError
@@ -115,6 +115,7 @@ def new_case(
     mirrored: bool = False,
     turned: Literal[0, 90, 180, 270] = 0,
     ignore_header: bool = False,
+    segment: bool = False,
 ) -> None:
     """Make a case folder of a CT, a segmentation, landmarks, a plan, a device and fluoroscopic images.
 
@@ -153,6 +154,8 @@ def new_case(
         mirrored: The pictures are mirror images of the usual ones, which have the patient's left on their right.
         turned: Degrees by which the pictures are turned clockwise against head up.
         ignore_header: What DICOM headers say of the side of the source and of the pictures' orientation means nothing.
+        segment: Find the bones in the CT if --labels is not given, and propose landmarks if --landmarks is not; see
+            `femoreg segment` and `femoreg landmarks`.
     """
     import sys
 
@@ -188,6 +191,7 @@ def new_case(
         mirrored=mirrored,
         turned=turned,
         ignore_header=ignore_header,
+        segment=segment,
     )
     console = Console(soft_wrap=True)
     if sys.stdin.isatty():

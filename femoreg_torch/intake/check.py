@@ -38,9 +38,10 @@ from femoreg_torch.intake.check_images import check_images, check_views, readabl
 from femoreg_torch.intake.found import Found
 from femoreg_torch.intake.planes import Picture
 from femoreg_torch.intake.start_picture import picture_of_start
-from femoreg_torch.intake.volumes import ct_warnings, cut_bones, described, header_warnings
+from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.registration.models import model_attenuation
 from femoreg_torch.volume import read_ct_told, read_landmarks
+from femoreg_torch.volume.borders import cut_bones
 
 _ANY_PATH = PlannedPath(FEMUR, torch.zeros(3).double(), torch.ones(3).double())
 _ANY_POINTS = {name: n * torch.ones(3).double() for n, name in enumerate(DEVICE_POINTS)}

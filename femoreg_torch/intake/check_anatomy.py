@@ -45,7 +45,9 @@ def check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: Found) -
     path = found.attempt(lambda: ct.file_path("image", folder, may_be_folder=True))
     labels_path = None
     if "labels" not in ct:
-        found.problem(f"{ct.where('labels')}: is missing, a label map of the bones was expected.")
+        found.problem(
+            f"{ct.where('labels')}: is missing, a label map of the bones was expected. `femoreg segment` makes one."
+        )
     else:
         labels_path = found.attempt(lambda: ct.file_path("labels", folder, may_be_folder=True))
     table = found.attempt(lambda: read_bones(ct, folder, HIP)) if labels_path is not None else None

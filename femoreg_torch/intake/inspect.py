@@ -17,7 +17,6 @@ from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import (
     ct_warnings,
-    cut_bones,
     described,
     fitting_tables,
     header_warnings,
@@ -33,6 +32,7 @@ from femoreg_torch.volume import (
     read_volume_told,
     segment_names,
 )
+from femoreg_torch.volume.borders import cut_bones
 from femoreg_torch.volume.dicom import is_dicom, series_in
 from femoreg_torch.volume.mesh_files import bounds_of
 from femoreg_torch.volume.segments import SEGMENTATION_SUFFIX

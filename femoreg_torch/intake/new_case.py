@@ -21,6 +21,7 @@ from femoreg_torch.fluoro import Display, Source, carm_settings, nearest_side, r
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.check import check_case
 from femoreg_torch.intake.volumes import fitting_tables
+from femoreg_torch.segment import load_bone_network, propose_landmarks, segment_bones
 from femoreg_torch.volume import (
     Volume,
     bone_labels,
@@ -41,6 +42,7 @@ from femoreg_torch.volume.dicom import is_dicom
 
 NEEDED = ("ct", "labels", "landmarks", "plan", "images")
 _COPIED = (".nii", ".nii.gz", ".nrrd", ".mha")  # volumes of one file, which are taken as they are
+_OWN_TABLE = "femoreg"  # of label maps that are made here
 _DEVICE_HU = 5000.0  # of the paper's device
 
 
@@ -73,6 +75,7 @@ class NewCase:
     mirrored: bool = False
     turned: int = 0
     ignore_header: bool = False
+    segment: bool = False  # labels and landmarks that are not given are found in the CT
 
 
 def make_case(out: Path, given: NewCase) -> list[str]:
@@ -99,7 +102,11 @@ def make_case(out: Path, given: NewCase) -> list[str]:
 
 def _check_given(given: NewCase) -> None:
     """Raises `InputError` for all flags that are missing, and files that are not there, at once."""
-    told = [f"--{name} is missing" for name in NEEDED if not getattr(given, name)]
+    found = ("labels", "landmarks") if given.segment else ()
+    offer = {"labels": " (--segment finds the bones in the CT)", "landmarks": " (--segment proposes them)"}
+    told = [
+        f"--{name} is missing{offer.get(name, '')}" for name in NEEDED if name not in found and not getattr(given, name)
+    ]
     paths = {name: getattr(given, name) for name in ("ct", "labels", "landmarks", "plan", "device", "device_points")}
     for name, path in {**paths, "device_transform": given.device_transform}.items():
         if path is not None and not Path(path).exists():
@@ -127,20 +134,22 @@ def _together(what: str, told: list[str]) -> str:
 def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     """What `case.yaml` is to hold; the files it names are copied into `folder`."""
     assert given.ct is not None  # seen by `_check_given`, as the others
-    assert given.labels is not None
-    assert given.landmarks is not None
     assert given.plan is not None
     ct, told = read_ct_told(given.ct, given.series)
     notes += told
-    landmarks = read_landmarks(given.landmarks)
+    given_landmarks = None if given.landmarks is None else read_landmarks(given.landmarks)
     entry_point, target = read_path_points(given.plan)
-    bones = _bones(given)
-    labels_name, labels = _labels(folder, given.labels, ct, bones, notes)
+    if given.labels is None:
+        bones, (labels_name, labels) = label_table(_OWN_TABLE), _segmented(folder, ct, notes)
+    else:
+        bones = _bones(given)
+        labels_name, labels = _labels(folder, given.labels, ct, bones, notes)
+    landmarks = given_landmarks or _proposed(labels, ct, bones, notes)
     side = given.side or _side(labels, ct, bones, landmarks, entry_point, notes)
     if femoral_head(side) not in landmarks:
         raise InputError(
-            f"{given.landmarks}: {femoral_head(side)}, the head of the operated femur, is missing. Place it in 3D "
-            "Slicer, in the centre of the head."
+            f"{given.landmarks or '--segment'}: {femoral_head(side)}, the head of the operated femur, is "
+            "missing. Place it in 3D Slicer, in the centre of the head."
         )
     write_landmarks(folder / "landmarks.json", landmarks)
     content: dict[str, Any] = {
@@ -160,6 +169,28 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     content |= _display(given, images, notes)
     content["views"] = _views(folder, images, device_images, given, notes)
     return content
+
+
+def _segmented(folder: Path, ct: Volume, notes: list[str]) -> tuple[str, Volume]:
+    """The name of the label map of the bones that the network finds in the CT, and the map."""
+    found = segment_bones(ct, load_bone_network())
+    write_volume(folder / "labels.nii.gz", found.labels)
+    sure = ", ".join(f"{bone} {share:.2f}" for bone, share in found.confidence.items())
+    notes.append(f"the bones were found in the CT by the shipped network (mean probability: {sure}): look at them")
+    notes += found.warnings
+    return "labels.nii.gz", found.labels
+
+
+def _proposed(labels: Volume, ct: Volume, bones: LabelTable, notes: list[str]) -> dict[str, Tensor]:
+    """Landmarks by the rules of `femoreg landmarks`."""
+    found = propose_landmarks(ct, bone_labels(labels, ct, bones, HIP, {}))
+    errors = ", ".join(f"{name} {error:.1f}" for name, error in found.expected_error_mm.items())
+    notes.append(
+        f"the landmarks are proposals by rules, with errors to expect of (mm) {errors}: correct landmarks.json"
+    )
+    notes += [f"no {name}: {why}" for name, why in found.left_out.items()]
+    notes += found.warnings
+    return found.points
 
 
 def _ct(folder: Path, path: Path, ct: Volume) -> str:

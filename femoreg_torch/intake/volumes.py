@@ -1,7 +1,7 @@
 """What is worth knowing, and worth a warning, of a CT and of a label map."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,12 @@ import torch
 
 from femoreg_torch.anatomy import label_table, label_table_names
 from femoreg_torch.volume import Volume
+from femoreg_torch.volume.borders import touched_faces
 
 _COARSE_MM, _COARSE_STEP_MM = 1.5, 3.0  # the registration takes voxels of 1 mm
 _SOFT_HU, _BONE_HU, _METAL_HU = -50.0, 300.0, 2800.0
 _LEAST_AIR = 0.005  # share of the voxels; beside every patient there is some
 _METAL_ML = 1.0
-_FACES = ("right", "left", "front", "back", "lower", "upper")  # low and high end of x, y, z
 _DISAGREE_MM = 0.5
 _NRRD_HEADER = 2**16  # bytes that hold it
 
@@ -50,37 +50,10 @@ def ct_warnings(ct: Volume) -> list[str]:
     metal = float((ct.data > _METAL_HU).sum()) * float(np.prod(ct.spacing_mm)) / 1000
     if metal > _METAL_ML:
         told.append(f"{metal:.1f} ml above {_METAL_HU:g} HU: metal, or its artefacts")
-    for face in _touched(ct.data > _BONE_HU, least_mm2=400.0, spacing=ct.spacing_mm):
+    for face in touched_faces(ct.data > _BONE_HU, least_mm2=400.0, spacing=ct.spacing_mm):
         if face in ("right", "left", "front", "back"):
             told.append(f"bone is cut at the {face} face of the CT")
     return told
-
-
-def cut_bones(labels: Volume, ids: Mapping[str, int], bones: Sequence[str]) -> list[str]:
-    """In words, which of these bones the border of the volume cuts where it should not.
-
-    A shaft that is cut below, and vertebrae above, are as usual.
-    """
-    told = []
-    for name in bones:
-        if name not in ids:
-            continue
-        faces = _touched(labels.data == ids[name], least_mm2=20.0, spacing=labels.spacing_mm)
-        usual = {"lower"} if name.startswith("femur") else {"upper"} if name in ("vertebrae", "sacrum") else set()
-        if cut := [face for face in faces if face not in usual]:
-            told.append(f"{name} is cut at the {' and '.join(cut)} face of the volume")
-    return told
-
-
-def _touched(inside: torch.Tensor, least_mm2: float, spacing: tuple[float, float, float]) -> list[str]:
-    """Faces of the volume where what is inside (Z, Y, X), bool, has at least that area."""
-    found = []
-    for axis in range(3):
-        area = float(np.prod([s for k, s in enumerate(spacing) if k != axis]))
-        for end in (0, -1):
-            if float(inside.select(2 - axis, end).sum()) * area >= least_mm2:
-                found.append(_FACES[2 * axis + (end != 0)])
-    return found
 
 
 def looks_like_labels(volume: Volume) -> bool:

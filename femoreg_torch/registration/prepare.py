@@ -146,7 +146,10 @@ def read_bones(case: Case) -> tuple[Volume, BoneLabels]:
     if case.ct_path is None:
         raise InputError(f"{case.folder}/case.yaml, ct.image: missing. Bones are taken from a CT.")
     if case.labels_path is None:
-        raise InputError(f"{case.folder}/case.yaml, ct.labels: missing. Give a label map of the bones.")
+        raise InputError(
+            f"{case.folder}/case.yaml, ct.labels: missing. Give a label map of the bones; "
+            "`femoreg segment` makes one of the CT, `femoreg new-case --segment` the whole case."
+        )
     ct, told = read_ct_told(case.ct_path)
     labels, done = read_labels_told(case.labels_path, ct, {n for ids in case.bones.values() for n in ids})
     bones = bone_labels(labels, ct, case.bones, case.anatomy, case.landmarks)

@@ -181,7 +181,27 @@ def write_volume(path: Path, volume: Volume) -> None:
     """
     if volume.data.dtype.is_floating_point:
         volume = volume.with_data(volume.data.round().clamp(-32768, 32767).to(torch.int16))
-    image = _image(volume)
+    _write(path, _image(volume))
+
+
+def write_labels_like(path: Path, labels: Volume, ct: Path) -> None:
+    """Write a label map that was made on a CT as `read_ct` gives it, with the index order of the CT's own file.
+
+    Of a DICOM series the order is that of `labels`. Raises `OSError` that names the file if it cannot be written.
+    """
+    image = _image(labels)
+    if ct.is_file() and not is_dicom(ct):
+        stored = read_itk(ct)
+        if stored.GetDimension() == 4:
+            stored = stored[:, :, :, 0]
+        code = sitk.DICOMOrientImageFilter.GetOrientationFromDirectionCosines(stored.GetDirection())
+        image = sitk.DICOMOrient(image, code)
+        if image.GetSize() == stored.GetSize():
+            image.CopyInformation(stored)
+    _write(path, image)
+
+
+def _write(path: Path, image: sitk.Image) -> None:
     with temporary_file(Path(path)) as part:
         try:
             with quiet():

@@ -7,7 +7,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sim.patient.around_surfaces.landmarks import unit
+from femoreg_torch.segment.rules import unit
 from sim.patient.around_surfaces.voxels import along_axes, block_mean, inside_surface, smooth_noise
 from sim.patient.bone_hu import MARROW_HU
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.segment.rules import find_surface_landmarks
 from femoreg_torch.volume import Volume, axis_aligned
 from sim.patient.around_surfaces.bone import FINE_MM, model_bone
-from sim.patient.around_surfaces.landmarks import find_surface_landmarks
 from sim.patient.around_surfaces.soft_tissue import make_soft_tissue
 from sim.patient.around_surfaces.surfaces import BoneSurfaces
 from sim.patient.around_surfaces.trunk import Surfaces, body_box, measure_trunk

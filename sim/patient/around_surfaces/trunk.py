@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sim.patient.around_surfaces.landmarks import unit
+from femoreg_torch.segment.rules import unit
 from sim.patient.skeleton import SIDES
 
 Points = NDArray[np.float64]

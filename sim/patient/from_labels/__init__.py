@@ -2,4 +2,4 @@
 
 from sim.patient.from_labels.patient import make_label_patient, write_label_patient
 
-__all__ = ["make_label_patient", "read_label_map", "write_label_patient"]
+__all__ = ["make_label_patient", "write_label_patient"]

@@ -15,10 +15,10 @@ from scipy.spatial import cKDTree
 
 from femoreg_torch.anatomy import HIP, LabelTable
 from femoreg_torch.errors import InputError
+from femoreg_torch.segment.sphere import refitted_sphere
 from femoreg_torch.volume import Volume
 from sim.patient.distance_field import Array, Field
 from sim.patient.skeleton import SIDES, Skeleton
-from sim.patient.sphere import refitted_sphere
 
 Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -10,10 +10,10 @@ from skimage.measure import marching_cubes
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
+from femoreg_torch.segment.rules import find_surface_landmarks
 from femoreg_torch.volume import read_ct, read_labels, read_landmarks
 from sim.commands import around_surfaces
 from sim.patient.around_surfaces import Options, read_surfaces
-from sim.patient.around_surfaces.landmarks import find_surface_landmarks
 from sim.patient.around_surfaces.surfaces import BONES
 from sim.patient.around_surfaces.voxels import block_mean, halved_voxels, inside_surface
 from sim.patient.landmarks import find_landmarks

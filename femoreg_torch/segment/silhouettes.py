@@ -12,15 +12,17 @@ Points = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _MARGIN_MM = 3.0
-_EDGE_MM = 6.0  # of the largest triangles: they are sampled so densely that no pixel within is missed
 
 
-def silhouette(points2: Points, faces: NDArray[np.int64], pixel_mm: float) -> tuple[Mask, Points]:
-    """Filled shadow of a mesh whose vertices project to `points2` (V, 2) mm, and the place (2,) of pixel (0, 0)."""
+def silhouette(points2: Points, faces: NDArray[np.int64], pixel_mm: float, edge_mm: float) -> tuple[Mask, Points]:
+    """Filled shadow of a mesh whose vertices project to `points2` (V, 2) mm, and the place (2,) of pixel (0, 0).
+
+    Triangles with edges up to `edge_mm` are sampled so densely that no pixel within is missed.
+    """
     origin = points2.min(0) - _MARGIN_MM
     image = np.zeros(np.ceil((points2.max(0) + _MARGIN_MM - origin) / pixel_mm).astype(int), bool)
     a, b, c = (points2[faces[:, k]] for k in range(3))
-    samples = math.ceil(_EDGE_MM / pixel_mm)  # along each side
+    samples = math.ceil(edge_mm / pixel_mm)  # along each side
     for i in range(samples + 1):
         for j in range(samples + 1 - i):
             sample = (a * i + b * j + c * (samples - i - j)) / samples

@@ -1,0 +1,112 @@
+"""`femoreg segment` and `femoreg landmarks`: bones and landmarks from a CT alone."""
+
+from pathlib import Path
+
+
+def segment(
+    ct: Path, *, out: Path, series: str | None = None, weights: Path | None = None, unrefined: bool = False
+) -> None:
+    """Label hip bones, sacrum, femora and vertebrae in a CT, left and right, without any download.
+
+    Writes OUT, a label map on the grid of the CT with the ids of the table `femoreg` (left hip bone 1, right 2,
+    vertebrae 3, sacrum 4, left femur 5, right 6), and beside it a picture of three planes (.png) and confidence,
+    volumes and warnings (.json). Look at the picture: the network has learned on synthetic CTs alone.
+
+    Args:
+        ct: CT in HU: folder of a DICOM series, or a NIfTI, NRRD or MHA file.
+        out: Label map to write (.nii.gz, .nrrd, .mha).
+        series: Which of several DICOM series: its number, UID, or a part of its description.
+        weights: Network weights (safetensors) that `femoreg train-segmentation` wrote; by default the shipped ones.
+        unrefined: Keep the network's outlines, on voxels of 3 mm, in place of the CT's edges.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+
+    from femoreg_torch.anatomy import HIP
+    from femoreg_torch.commands.intake import write_picture
+    from femoreg_torch.errors import InputError
+    from femoreg_torch.files import write_json
+    from femoreg_torch.intake.planes import three_planes
+    from femoreg_torch.segment import load_bone_network, segment_bones
+    from femoreg_torch.volume import read_ct_told
+    from femoreg_torch.volume.reading import write_labels_like
+
+    suffix = next((s for s in (".nii.gz", ".nii", ".nrrd", ".mha") if out.name.lower().endswith(s)), None)
+    if suffix is None:
+        raise InputError(f"{out}: the label map's name is to end in .nii.gz, .nrrd or .mha.")
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: cannot be written, there is no folder {out.parent}. Make it first.")
+    if ct.exists() and out.exists() and out.samefile(ct):
+        raise InputError(f"{out}: is the CT itself. Choose another name for the label map.")
+    console = Console(soft_wrap=True)
+    volume, told = read_ct_told(ct, series)
+    with console.status("looking for bones"):
+        found = segment_bones(volume, load_bone_network(weights), refine=not unrefined)
+    write_labels_like(out, found.labels, ct)
+    stem = out.with_name(out.name[: -len(suffix)])
+    write_json(
+        stem.with_name(stem.name + ".json"),
+        {
+            "labels": out.name,
+            "table": "femoreg",
+            "confidence": {bone: round(share, 3) for bone, share in found.confidence.items()},
+            "volume_ml": {bone: round(volume_ml, 1) for bone, volume_ml in found.volume_ml.items()},
+            "warnings": list(found.warnings),
+        },
+    )
+    colours = {1 + n: bone.colour for n, bone in enumerate(HIP.bones)}
+    write_picture(stem.with_name(stem.name + ".png"), three_planes(volume, found.labels, colours, {}))
+    for note in told:
+        console.print(f"  {escape(note)}", highlight=False)
+    for bone, volume_ml in found.volume_ml.items():
+        console.print(f"  {bone}: {volume_ml:.0f} ml, mean probability {found.confidence[bone]:.2f}", highlight=False)
+    for warning in found.warnings:
+        console.print(f"[yellow]Warning:[/] {escape(warning)}.", highlight=False)
+    console.print(f"Label map: {escape(str(out))}; look at {escape(stem.name)}.png before you use it.", highlight=False)
+
+
+def landmarks(ct: Path, labels: Path, *, out: Path, bones: str = "femoreg", series: str | None = None) -> None:
+    """Propose the 14 hip landmarks of a CT from its label map, by the rules that the landmark network was trained with.
+
+    Writes OUT (.mrk.json: markups of 3D Slicer, to be corrected there; else plain JSON) and says the error to expect of
+    each. Landmarks that lie outside of the CT, or on bone that is cut off, are left out.
+
+    Args:
+        ct: CT in HU: folder of a DICOM series, or a NIfTI, NRRD or MHA file.
+        labels: Label map of hip bones and femora.
+        out: File to write (.mrk.json or .json).
+        bones: Label table of the map (femoreg, totalsegmentator_v2, …, or a YAML file).
+        series: Which of several DICOM series: its number, UID, or a part of its description.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+
+    from femoreg_torch.anatomy import HIP, label_table
+    from femoreg_torch.errors import InputError
+    from femoreg_torch.segment import propose_landmarks
+    from femoreg_torch.volume import bone_labels, read_ct_told, read_labels_told, swapped_sides, write_landmarks
+
+    if not out.name.lower().endswith(".json"):
+        raise InputError(f"{out}: the name is to end in .mrk.json or .json.")
+    console = Console(soft_wrap=True)
+    volume, told = read_ct_told(ct, series)
+    table = label_table(bones)
+    found_labels, more = read_labels_told(labels, volume, {n for ids in table.values() for n in ids})
+    known = bone_labels(found_labels, volume, table, HIP, {})
+    with console.status("looking for landmarks"):
+        found = propose_landmarks(volume, known)
+    if not found.points:
+        raise InputError(f"{labels}: no landmark could be found on its bones. Look at it with `femoreg inspect`.")
+    write_landmarks(out, found.points)
+    for note in (*told, *more):
+        console.print(f"  {escape(note)}", highlight=False)
+    for name, error in found.expected_error_mm.items():
+        console.print(f"  {name}: expected error {error:.1f} mm", highlight=False)
+    for side, radius in found.head_radius_mm.items():
+        residual = found.head_residual_mm[side]
+        console.print(f"  {side} femoral head: radius {radius:.1f} mm, {residual:.2f} mm off a sphere", highlight=False)
+    for name, why in found.left_out.items():
+        console.print(f"[yellow]Left out:[/] {name}: {why}.", highlight=False)
+    for warning in (*found.warnings, *swapped_sides(known, found.points, HIP)):
+        console.print(f"[yellow]Warning:[/] {escape(warning)}.", highlight=False)
+    console.print(f"Landmarks: {escape(str(out))}. Look at them in 3D Slicer and correct them.", highlight=False)

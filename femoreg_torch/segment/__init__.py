@@ -1,0 +1,14 @@
+"""Bones and landmarks from a CT alone."""
+
+from femoreg_torch.segment.bones import Segmentation, segment_bones
+from femoreg_torch.segment.network import BoneNetwork, load_bone_network
+from femoreg_torch.segment.points import Proposal, propose_landmarks
+
+__all__ = [
+    "BoneNetwork",
+    "Proposal",
+    "Segmentation",
+    "load_bone_network",
+    "propose_landmarks",
+    "segment_bones",
+]

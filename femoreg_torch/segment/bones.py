@@ -1,0 +1,169 @@
+"""The bones of a CT: labels on its own grid, how sure they are, and what to look at before they are used."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.segment.network import BoneNetwork, bone_shares
+from femoreg_torch.segment.refine import contact, refined_labels, unrefined_labels
+from femoreg_torch.volume import Volume
+from femoreg_torch.volume.borders import cut_bones
+
+_BONE_HU, _METAL_HU = 200.0, 2800.0
+_LEAST_HIP_ML = 15.0  # of a hip bone; whole ones of adults have 180 to 400
+_LEAST_FEMUR_ML = 10.0
+_LEAST_CONFIDENCE = 0.6  # mean probability of a bone; with less it is left out
+_DOUBTED = 0.85  # mean share of a bone below which a warning is given
+_CLOSED_MM2 = 150.0  # of contact between femur and hip bone; a head has some 5000 mm² in its socket
+_METAL_ML = 0.5
+_MAIN_PART = 0.3  # of the largest part of the hip bones; smaller ones may be stray specks
+_SIDE_SHARE = {"femur": 0.6, "hip": 0.97}  # a part with so much of one side is all of it; hip bones may meet
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """Bones found in a CT."""
+
+    labels: Volume  # uint8 on the CT's grid: 0, or 1 + the bone's number in the anatomy
+    confidence: dict[str, float]  # by bone: mean probability that the network gives its voxels
+    volume_ml: dict[str, float]  # by bone
+    warnings: tuple[str, ...]
+
+
+def segment_bones(ct: Volume, network: BoneNetwork, refine: bool = True) -> Segmentation:
+    """Hip bones, sacrum, femora and vertebrae of a CT in HU.
+
+    With `refine` their edges are those of the CT (`refined_labels`), without it those of the network. Raises
+    `InputError` if there is no bone, or neither a hip bone nor an upper femur.
+    """
+    bright_ml = float((ct.data > _BONE_HU).sum()) * float(np.prod(ct.spacing_mm)) / 1000
+    if bright_ml < _LEAST_FEMUR_ML:
+        raise InputError(
+            f"segment: only {bright_ml:.1f} ml of the CT are above {_BONE_HU:g} HU, so it holds no bone. Is it in HU?"
+        )
+    shares, grid = bone_shares(network, ct)
+    shares = _spine_apart(_sides_told_apart(shares, network), network)
+    anatomy = network.anatomy
+    data = refined_labels(ct, shares, grid, anatomy) if refine else unrefined_labels(ct, shares, grid, anatomy)
+    counts = torch.bincount(data.flatten(), minlength=1 + len(anatomy.bones)).tolist()
+    voxel_ml = float(np.prod(ct.spacing_mm)) / 1000
+    volume_ml = {name: n * voxel_ml for name, n in zip(anatomy.bone_names, counts[1:], strict=True) if n}
+    confidence = {name: _confidence(shares, 1 + anatomy.bone_names.index(name)) for name in volume_ml}
+    doubtful = [name for name, share in confidence.items() if share < _LEAST_CONFIDENCE]
+    hips = [side for side in ("left", "right") if _is_there(volume_ml, confidence, f"hip_{side}", _LEAST_HIP_ML)]
+    femora = [side for side in ("left", "right") if _is_there(volume_ml, confidence, f"femur_{side}", _LEAST_FEMUR_ML)]
+    if not hips or not femora:
+        lacking = " and ".join(name for name, there in (("hip bone", hips), ("upper femur", femora)) if not there)
+        raise InputError(
+            f"segment: no {lacking} was found in {bright_ml:.0f} ml of bone. A CT of the hip was expected: is it of "
+            "another part of the body, or turned against what its header says?"
+        )
+    left_out = []
+    for name in doubtful:
+        data[data == 1 + anatomy.bone_names.index(name)] = 0
+        told = f"{volume_ml.pop(name):.0f} ml, mean probability {confidence.pop(name):.2f}"
+        left_out.append(f"what may be {name} ({told}) was left out: the network is not sure")
+    labels = Volume(data, ct.lps_from_index)
+    warnings = left_out + _warnings(ct, labels, network, volume_ml, confidence, hips)
+    return Segmentation(labels, confidence, volume_ml, tuple(warnings))
+
+
+def _is_there(volume_ml: dict[str, float], confidence: dict[str, float], bone: str, least_ml: float) -> bool:
+    return volume_ml.get(bone, 0.0) >= least_ml and confidence.get(bone, 0.0) >= _LEAST_CONFIDENCE
+
+
+def _confidence(shares: Tensor, number: int) -> float:
+    inside = shares.argmax(0) == number
+    return float(shares[number][inside].mean()) if bool(inside.any()) else 0.0
+
+
+def _sides_told_apart(shares: Tensor, network: BoneNetwork) -> Tensor:
+    """The shares, with each connected femur, or hip bone that is mostly of one side, wholly of that side."""
+    names = network.anatomy.bone_names
+    coarse = shares.argmax(0).numpy()
+    result = shares.clone()
+    for bone in ("femur", "hip"):
+        left, right = (1 + names.index(f"{bone}_{side}") for side in ("left", "right"))
+        parts, count = ndimage.label((coarse == left) | (coarse == right))
+        for part in range(1, count + 1):
+            inside = parts == part
+            share = float((coarse[inside] == left).mean())
+            if 0 < share < 1 and max(share, 1 - share) >= _SIDE_SHARE[bone]:
+                keep, drop = (left, right) if share > 0.5 else (right, left)
+                near = torch.from_numpy(ndimage.binary_dilation(inside))
+                result[keep][near] += result[drop][near]
+                result[drop][near] = 0
+    return result
+
+
+def _spine_apart(shares: Tensor, network: BoneNetwork) -> Tensor:
+    """The shares, with what is called a femur above the hip bones given to the vertebrae.
+
+    No crop that the network learned from reaches far above the pelvis, and there it takes vertebrae for shafts.
+    """
+    names = network.anatomy.bone_names
+    coarse = shares.argmax(0).numpy()
+    hips = (coarse == 1 + names.index("hip_left")) | (coarse == 1 + names.index("hip_right"))
+    parts, count = ndimage.label(hips)
+    if not count:
+        return shares
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    main = (sizes > _MAIN_PART * sizes.max())[parts]
+    top = 1 + int(np.flatnonzero(main.any((1, 2))).max())
+    result = shares.clone()
+    for side in ("left", "right"):
+        femur = 1 + names.index(f"femur_{side}")
+        result[1 + names.index("vertebrae"), top:] += result[femur, top:]
+        result[femur, top:] = 0
+    return result
+
+
+def _warnings(
+    ct: Volume,
+    labels: Volume,
+    network: BoneNetwork,
+    volume_ml: dict[str, float],
+    confidence: dict[str, float],
+    hips: list[str],
+) -> list[str]:
+    names = network.anatomy.bone_names
+    ids = {name: 1 + names.index(name) for name in volume_ml}
+    told = cut_bones(labels, ids, list(ids))
+    if len(hips) == 1:
+        other = "right" if hips == ["left"] else "left"
+        told.append(f"the {other} hip bone is not in the CT: one half of the pelvis is missing")
+    metal = float((ct.data > _METAL_HU).sum()) * float(np.prod(ct.spacing_mm)) / 1000
+    if metal > _METAL_ML:
+        told.append(f"{metal:.1f} ml of metal: look at the bones around it")
+    z, y, x = (ct.spacing_mm[k] for k in (2, 1, 0))
+    face_mm2 = float(np.mean([y * x, z * x, z * y]))
+    data = labels.data.numpy()
+    for side in ("left", "right"):
+        femur, hip = f"femur_{side}", f"hip_{side}"
+        if {femur, hip} <= set(ids):
+            closed = contact(data, ids[femur], ids[hip]).sum() / 2 * face_mm2
+            if closed > _CLOSED_MM2:
+                told.append(f"{femur} and {hip} touch over {closed:.0f} mm²: the joint space is not open")
+    told += [
+        f"{name}: the network is not sure (mean probability {share:.2f})"
+        for name, share in confidence.items()
+        if share < _DOUBTED
+    ]
+    centres = {name: _middle_x(labels, ids[name]) for name in ids if name.endswith(("left", "right"))}
+    for bone in ("hip", "femur"):
+        pair = [centres.get(f"{bone}_{side}") for side in ("left", "right")]
+        if pair[0] is not None and pair[1] is not None and pair[0] < pair[1]:
+            told.append(f"{bone}_left lies to the right of {bone}_right: is the CT mirrored?")
+    return told
+
+
+def _middle_x(labels: Volume, number: int) -> float:
+    """Mean x of a label, mm LPS."""
+    index = torch.nonzero(labels.data == number).double().mean(0).flip(0)
+    affine = labels.lps_from_index
+    return float((affine[:3, :3] @ index + affine[:3, 3])[0])
