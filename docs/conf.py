@@ -24,7 +24,7 @@ include_patterns = [
     "docs/**",
     "notebooks/*",
     "examples/README.md",
-    "models/weights/README.md",
+    "models/weights/*.md",
     "benchmarks/RESULTS.md",
     "ARCHITECTURE.md",
     "CHANGELOG.md",
