@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import numba
 import pytest
 
 # Several processes of tests share the machine's cores. Libraries read these when they are first imported.
@@ -10,6 +11,7 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
     _threads = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
     for _library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
         os.environ.setdefault(f"{_library}_NUM_THREADS", str(_threads))
+    numba.config.reload_config()  # pytest has imported it already, to know its warnings
 
 
 @pytest.fixture(scope="session")

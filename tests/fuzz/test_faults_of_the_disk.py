@@ -17,6 +17,7 @@ from fuzz_doors import doors
 from fuzz_faults import FAULT, fault, full_after
 
 import femoreg_torch.evaluation
+import femoreg_torch.evaluation.report
 import femoreg_torch.evaluation.run
 import femoreg_torch.registration.run
 import sim.theatre.case_folders
@@ -47,10 +48,11 @@ def commands(given: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str
     monkeypatch.setattr(femoreg_torch.registration.run, "register_scene", lambda *_, **__: (result, None))
     monkeypatch.setattr(femoreg_torch.evaluation, "evaluate", lambda *_: None)
     for name, value in {
-        "check_fits": None, "prepare_scene": None, "evaluate": None, "draw": None, "report_page": 1000 * "page ",
+        "check_fits": None, "prepare_scene": None, "evaluate": None, "draw": None,
         "overlay_figure": np.zeros((9, 9, 3), np.uint8),
     }.items():  # fmt: skip
         monkeypatch.setattr(femoreg_torch.evaluation.run, name, lambda *_, value=value: value)
+    monkeypatch.setattr(femoreg_torch.evaluation.report, "report_page", lambda *_: 1000 * "page ")
     for name, value in {
         "read_mesh": None, "_case_scan": (None, None), "metal_in_beam": None, "simulate_images": views,
         "draw_procedure": SimpleNamespace(truth=truth), "write_preview": None,

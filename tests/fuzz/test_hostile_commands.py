@@ -11,6 +11,7 @@ import pytest
 from fuzz_doors import doors
 from fuzz_mutators import NASTY, mutated_text
 
+import femoreg_torch.evaluation.report
 import femoreg_torch.evaluation.run
 from femoreg_torch.commands import main as module
 from femoreg_torch.commands.main import main
@@ -34,7 +35,7 @@ def test_broken_results_by_the_commands_that_read_them(
     monkeypatch.setattr(femoreg_torch.evaluation.run, "prepare_scene", lambda *_: None)
     monkeypatch.setattr(femoreg_torch.evaluation.run, "evaluate", lambda *_: None)
     monkeypatch.setattr(femoreg_torch.evaluation.run, "draw", lambda *_: None)
-    monkeypatch.setattr(femoreg_torch.evaluation.run, "report_page", lambda *_: "page")
+    monkeypatch.setattr(femoreg_torch.evaluation.report, "report_page", lambda *_: "page")
     monkeypatch.setattr(femoreg_torch.evaluation.run, "overlay_figure", lambda *_: np.zeros((9, 9, 3), np.uint8))
     capfd.readouterr()
     finds = []
