@@ -21,7 +21,7 @@ from femoreg_torch.registration.scene import Scene
 _MOST_OFF_ORBIT_MM, _MOST_OFF_ORBIT_DEG = 60.0, 15.0
 _ORBIT_DEG = 100.0
 # Of the anatomy between images without and with the device. Seen in all views together where nothing had moved,
-# whatever else was wrong: at most 0.1 mm, 0.2° and 1.4 deviations; in one view by itself 0.4 mm, 0.1° and 2.8. Where a
+# whatever else was wrong: at most 0.1 mm, 0.2° and 1.6 deviations; in one view by itself 0.4 mm, 0.1° and 2.8. Where a
 # patient had moved by 1 mm and 1°: 0.9 to 1.1°, and 10 to 12 deviations.
 _MOST_MOTION_MM, _MOST_MOTION_DEG, _SURE_OF_MOTION = 0.3, 0.3, 3.0
 # Of the file's standard deviation, where intrinsics were refined. Seen: 1.4 and 1.7 where all were told 12 mm off (six
