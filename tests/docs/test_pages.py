@@ -101,4 +101,6 @@ def test_what_is_run_apart_runs_from_the_first_page_to_the_last(tmp_path: Path) 
 
 
 def test_a_mark_without_a_reason_is_none() -> None:
-    assert not re.search(r"<!-- (run apart|not run)(?!: .{5,} -->)", "".join((ROOT / p).read_text() for p in pages()))
+    assert not re.search(
+        r"<!-- (run apart|not run)(?!: .{5,} -->)", "".join((ROOT / p).read_text(encoding="utf-8") for p in pages())
+    )
