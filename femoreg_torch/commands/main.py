@@ -8,6 +8,7 @@ Only the chosen command is imported.
 """
 
 import ast
+import atexit
 import inspect
 import os
 import sys
@@ -16,7 +17,7 @@ from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, NoReturn, get_args, get_origin, get_type_hints
 
 import femoreg_torch
 from femoreg_torch.commands.status import BAD_INPUT, DONE, INTERRUPTED
@@ -76,6 +77,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         return _tell_defect(error)
     return DONE
+
+
+def console_script() -> NoReturn:
+    """The installed command `femoreg`: `main`, and an end without Python's own clearing up.
+
+    Taking modules and memory apart one by one takes more than a second after a registration, and the system does it at
+    once. Before that, threads have ended, and all that was registered for the end has run.
+    """
+    ended: list[int] = []
+    atexit.register(_end, ended)  # what is registered first runs last
+    ended.append(main())
+    sys.exit(ended[0])
+
+
+def _end(ended: Sequence[int]) -> None:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if ended:
+        os._exit(ended[0])
 
 
 def _tell_defect(error: Exception) -> int:

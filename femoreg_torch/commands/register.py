@@ -61,12 +61,15 @@ def register(
     from femoreg_torch.commands.status import NOT_TRUSTED
     from femoreg_torch.commands.telling import progress_report, tell_device, tell_verdict
     from femoreg_torch.navigation import summary
-    from femoreg_torch.planning.quote import quoted_gain, response_of
 
     console = Console()
     place = tell_device(console, device)
     read = read_case(case)
-    response = response_of(read)
+    response = None
+    if read.plan is not None and read.plan.file is not None:  # else the planner is loaded for nothing
+        from femoreg_torch.planning.quote import response_of
+
+        response = response_of(read)
     with progress_report(console, "reading the case") as report:
         result, navigation = register_into(
             out,
@@ -81,9 +84,12 @@ def register(
             report=report,
         )
     tell_verdict(console, result)
-    quoted = quoted_gain(response, result)
-    if quoted is not None:
-        console.print(quoted.sentence)
+    if response is not None:
+        from femoreg_torch.planning.quote import quoted_gain
+
+        quoted = quoted_gain(response, result)
+        if quoted is not None:
+            console.print(quoted.sentence)
     for line in [] if navigation is None else summary(navigation):
         console.print(line)
     console.print(f"Result written to {escape(str(out / RESULT_NAME))} ({result.timings_s['total']:.0f} s).")

@@ -253,3 +253,21 @@ def test_a_data_set_is_asked_for_by_the_name_of_its_preset(tmp_path: Path) -> No
     assert done.returncode == 2
     assert "'nothing'" in done.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("arguments", "status"), [(["--version"], 0), (["no-such-command"], 2)])
+def test_the_installed_command_ends_with_its_status_after_all_that_was_registered(
+    arguments: list[str], status: int
+) -> None:
+    code = (
+        "import atexit, sys\n"
+        "from femoreg_torch.commands import main\n"
+        "inner = main.main\n"
+        "main.main = lambda: (atexit.register(print, 'registered later'), inner())[1]\n"
+        f"sys.argv = ['femoreg', *{arguments!r}]\n"
+        "main.console_script()"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == status
+    assert ended.stdout.endswith("registered later\n")
+    assert bool(ended.stderr) == (status == 2)
