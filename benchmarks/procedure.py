@@ -20,7 +20,7 @@ from statistics import median
 from measure import in_own_process, machine, table, write_section
 from samples import samples_of_a_registration
 
-_COMMAND = "import sys; from femoreg_torch.commands.main import main; sys.exit(main())"
+_COMMAND = "from femoreg_torch.commands.main import console_script; console_script()"
 _IMPORTS = "import femoreg_torch.commands.register, femoreg_torch.registration.run, femoreg_torch.evaluation"
 _THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS")  # NumPy's are a matter of the command
 
