@@ -6,6 +6,7 @@ Each directive writes Markdown from parsers, docstrings or dataclasses, which Sp
 import dataclasses
 import inspect
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -20,7 +21,7 @@ import femoreg_torch
 from femoreg_torch.commands.main import GROUP, parser_of
 
 
-class FromCode(SphinxDirective):
+class FromCode(SphinxDirective, ABC):
     """Puts Markdown made by `markdown` in its place, headings included."""
 
     optional_arguments = 1
@@ -29,9 +30,9 @@ class FromCode(SphinxDirective):
         """The nodes that Sphinx reads from it."""
         return self.parse_text_to_nodes("\n".join(self.markdown()), allow_section_headings=True)
 
+    @abstractmethod
     def markdown(self) -> Iterator[str]:
         """Lines of Markdown."""
-        raise NotImplementedError
 
 
 class Commands(FromCode):

@@ -103,7 +103,7 @@ def in_beam(metal: Metal, camera: Camera, columns: Array, rows: Array) -> Array:
     """Millimetres (P,) of metal, by its weight, along the rays of pixels (P,); surfaces in the frame of the camera.
 
     Sum of the distances at which a ray leaves a closed surface less those at which it enters (Möller and Trumbore,
-    J Graph Tools 2 (1997) 21).
+    J Graph Tools 2 (1997) 21). The rays of trimesh need packages that users of beads do not have.
     """
     scale = camera.sdd_mm / np.array([camera.pixel_mm[1], camera.pixel_mm[0]])
     middle = np.array(camera.principal_point_px)

@@ -35,12 +35,13 @@ from femoreg_torch.geometry import (
 )
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.regions import (
+    Borders,
     Doubles,
     Indices,
     RegionVoxels,
     blocks_of,
     materials,
-    mistakable,
+    mistakes,
     region_paths,
     region_voxels,
     touching_faces,
@@ -64,11 +65,6 @@ _ITERATIONS, _FEWER = 200, 40  # of L-BFGS from nothing, and from the round befo
 _TWIST = np.array([0.01] * 3 + [1.0] * 3)  # rad and mm: one unit of the pose
 _MOST_DEG, _MOST_MM = 8.0, 12.0  # that the device may move; more means that the images do not show it as it is
 _AS_NAMED = 0.3  # logarithm: one material so near to what the case names is that
-# Share of the blocks beside another material that are of that: a tenth to a third on three simulated devices. With an
-# eighth, the stated deviations of 16 devices held 69 to 88 % of their errors, and twice them 94 to 100 %; without, 53
-# to 87 and 80 to 100 %.
-_TAKEN_FOR_ANOTHER = 0.125
-_DRAWN_MISTAKES = 12
 _CORNERS = 4  # of the box around the device: scattered light is interpolated between them
 
 
@@ -165,7 +161,7 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
         poses, fit, seen, used = _settled(scene, poses, device, fit, seen)
         material, attenuation = materials(fit[:count], np.bincount(blocks[blocks >= 0].numpy(), minlength=count))
         fit = np.concatenate([attenuation, fit[count:]])
-        borders = _Borders(blocks, material, touching) if len(attenuation) > 1 else None
+        borders = Borders(blocks, material, touching) if len(attenuation) > 1 else None
         device = _device(name, kind, share, torch.from_numpy(np.append(material, -1))[blocks], len(attenuation))
         evaluations += used
     poses, fit, seen, used = _settled(scene, poses, device, fit, seen)
@@ -180,7 +176,7 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
         {v.view: float((v.corners @ fit[_scatter_of(n, device.regions)]).mean()) for n, v in enumerate(seen)},
         float(np.median(misfit)),
         evaluations + used,
-        () if borders is None else _mistakes(share, borders, attenuation),
+        () if borders is None else mistakes(share, borders, attenuation),
     )
 
 
@@ -200,33 +196,6 @@ class _Device:
         """Its attenuation, 1/mm, from that of its regions."""
         of_voxel = torch.from_numpy(np.append(attenuation, 0.0)).float()[self.owner]
         return self.share.with_data(self.share.data * of_voxel)
-
-
-@dataclass(frozen=True, eq=False)
-class _Borders:
-    """Blocks of a solid whose materials were estimated."""
-
-    blocks: Tensor  # (Z, Y, X): the block of every voxel, −1 where it is empty
-    material: Indices  # of every block
-    touching: Indices  # (n, 3): pairs of blocks, and the faces between them
-
-
-def _mistakes(share: Volume, borders: _Borders, attenuation: Doubles) -> tuple[Volume, ...]:
-    """Differences of attenuation, see `RigidObject.unsure`: blocks that border on another material, taken for it.
-
-    All of them in each difference, up or down by chance, so that the squares of what the differences do to an image
-    add up to those of what each block does (Hutchinson, Commun Stat Simul Comput 18 (1989) 1059). Always the same
-    chance: a result is to be repeatable.
-    """
-    block, more = mistakable(borders.material, attenuation, borders.touching)
-    chance = np.random.default_rng(0)
-    found = []
-    for _ in range(_DRAWN_MISTAKES):
-        amount = np.zeros(len(borders.material) + 1)  # the last one is that of empty voxels
-        np.add.at(amount, block, chance.choice([-1.0, 1.0], len(block)) * more)
-        amount *= math.sqrt(_TAKEN_FOR_ANOTHER * (1 - _TAKEN_FOR_ANOTHER) / _DRAWN_MISTAKES)
-        found.append(share.with_data(share.data * torch.from_numpy(amount).float()[borders.blocks]))
-    return tuple(found)
 
 
 def _device(

@@ -18,6 +18,11 @@ _BLOCK_MM = 6.0  # longest edge of a block of a solid whose parts nobody names
 # material is common, and a second one would be the fit's noise; where there are several anyhow, they are told apart.
 _SPREAD_OF_ONE, _SPREAD_OF_SEVERAL = 0.4, 0.2
 _MOST_MATERIALS = 4
+# Share of the blocks beside another material that are of that: a tenth to a third on three simulated devices. With an
+# eighth, the stated deviations of 16 devices held 69 to 88 % of their errors, and twice them 94 to 100 %; without, 53
+# to 87 and 80 to 100 %.
+_TAKEN_FOR_ANOTHER = 0.125
+_DRAWN_MISTAKES = 12
 _LEAST_ATTENUATION = 0.01  # 1/mm: what is below is as good as air
 
 Doubles = NDArray[np.float64]
@@ -66,6 +71,34 @@ def mistakable(material: Indices, attenuation: Doubles, touching: Indices) -> tu
     pairs = np.column_stack([pairs[:, 0], material[pairs[:, 1]]])
     block, other = np.unique(pairs[material[pairs[:, 0]] != pairs[:, 1]], axis=0).T
     return block, attenuation[other] - attenuation[material[block]]
+
+
+@dataclass(frozen=True, eq=False)
+class Borders:
+    """Blocks of a solid whose materials were estimated."""
+
+    blocks: Tensor  # (Z, Y, X): the block of every voxel, −1 where it is empty
+    material: Indices  # of every block
+    touching: Indices  # (n, 3): pairs of blocks, and the faces between them
+
+
+def mistakes(share: Volume, borders: Borders, attenuation: Doubles) -> tuple[Volume, ...]:
+    """Differences of attenuation, 1/mm: blocks that border on another material, taken for the wrong one of the two.
+
+    `share` holds how much of every voxel is inside, `attenuation` that of the materials. All such blocks stand in each
+    difference, up or down by chance, so that the squares of what the differences do to an image add up to those of what
+    each block does (Hutchinson, Commun Stat Simul Comput 18 (1989) 1059). The chance is always the same, so that a
+    result can be repeated.
+    """
+    block, more = mistakable(borders.material, attenuation, borders.touching)
+    chance = np.random.default_rng(0)
+    found = []
+    for _ in range(_DRAWN_MISTAKES):
+        amount = np.zeros(len(borders.material) + 1)  # the last one is that of empty voxels
+        np.add.at(amount, block, chance.choice([-1.0, 1.0], len(block)) * more)
+        amount *= math.sqrt(_TAKEN_FOR_ANOTHER * (1 - _TAKEN_FOR_ANOTHER) / _DRAWN_MISTAKES)
+        found.append(share.with_data(share.data * torch.from_numpy(amount).float()[borders.blocks]))
+    return tuple(found)
 
 
 @dataclass(frozen=True, eq=False)

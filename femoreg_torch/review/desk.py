@@ -161,7 +161,8 @@ class Desk:
                 placed = placed_at_first(
                     self.case, self.scene, None if self._reviewed is None else self._reviewed.result
                 )
-            self._keep(placed, reset=change.do == "reset")
+            if change.do != "reset":
+                self._keep(placed)
             self._placed = placed
             self._revision += 1
 
@@ -178,9 +179,7 @@ class Desk:
             raise InputError("the network finds no landmark in the first image. Put them there by hand.")
         return replace(placed, landmarks=seen)
 
-    def _keep(self, placed: Placed, reset: bool) -> None:
-        if reset:
-            return
+    def _keep(self, placed: Placed) -> None:
         if placed.landmarks != self._placed.landmarks:
             keep_landmarks(self.run, self.case, placed)
         if placed.poses is not self._placed.poses:

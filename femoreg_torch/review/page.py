@@ -1,15 +1,11 @@
 """The page of a review: verdict and decision, the images to work on, and the report."""
 
-from functools import cache
 from typing import Any
-
-import jinja2
-from markupsafe import Markup
 
 from femoreg_torch.case.review import read_review
 from femoreg_torch.evaluation.colours import GUIDE, PATH, hexadecimal, object_colours
 from femoreg_torch.evaluation.report.card import card
-from femoreg_torch.evaluation.report.page import script_hashes
+from femoreg_torch.evaluation.report.page import script_hashes, source_of, templates_of
 from femoreg_torch.navigation.report import NOTICE
 from femoreg_torch.review.desk import Desk
 from femoreg_torch.review.placing import ALL
@@ -17,13 +13,13 @@ from femoreg_torch.review.placing import ALL
 
 def review_page(desk: Desk, message: str = "") -> tuple[str, str]:
     """The page as text, and its Content-Security-Policy: its own script by its hash, and this server alone."""
-    environment = _environment()
-    script = Markup(_source("review.js"))
+    templates = templates_of("femoreg_torch.review")
+    script = source_of(templates, "review.js")
     reviewed, case, scene = desk.reviewed, desk.case, desk.scene
     digest = "" if reviewed is None else reviewed.digest
     points = {name: thing.reference_point for name, thing in scene.objects.items()}
     colours = object_colours(scene.objects)
-    text = environment.get_template("review.html").render(
+    text = templates.get_template("review.html").render(
         name=desk.run.resolve().name,
         case=case.folder.resolve().name,
         card=None if reviewed is None else card(case, reviewed.result, points),
@@ -45,7 +41,7 @@ def review_page(desk: Desk, message: str = "") -> tuple[str, str]:
             "digest": digest,
             "pixel_mm": case.carm.camera.mean_pixel_mm,
         },
-        style=Markup(_source("review.css")),
+        style=source_of(templates, "review.css"),
         script=script,
     )
     policy = (
@@ -72,21 +68,3 @@ def _panels(desk: Desk) -> list[dict[str, Any]]:
         }
         for (kind, view), picture in desk.pictures.items()
     ]
-
-
-@cache
-def _environment() -> jinja2.Environment:
-    return jinja2.Environment(
-        loader=jinja2.PackageLoader("femoreg_torch.review"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-
-
-def _source(name: str) -> str:
-    """The text of a file in the folder of the templates, as it stands there."""
-    loader, environment = _environment().loader, _environment()
-    assert loader is not None
-    return loader.get_source(environment, name)[0]

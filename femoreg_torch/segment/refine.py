@@ -26,8 +26,8 @@ _SOFT_HU = 50.0
 _EDGE_SHARE = 0.35  # of the way from soft tissue to the brightest bone within `_NEAR_MM`
 _LOWEST_EDGE_HU, _HIGHEST_EDGE_HU = 130.0, 300.0
 _NEAR_MM = 3.0
-_SOFTNESS_HU = 100.0  # over which the CT's word goes from "surely not" to "surely"
-_CT_WEIGHT = 0.35  # of the CT's word against the network's share: 0.15 to 0.85 is the band where the CT decides
+_SOFTNESS_HU = 100.0  # about the threshold, over which the CT's evidence goes from −1 (no bone) to 1 (bone)
+_CT_WEIGHT = 0.35  # of the CT's evidence beside the network's share: 0.15 to 0.85 is the band where the CT decides
 _JOINT_WEIGHT = 2.0  # where hip bone and femur are equally likely lies the joint space, and the CT decides
 _METAL_HU, _METAL_MM = 2300.0, 3.0  # in metal and so far around it the network decides alone
 _CLOSE_MM = 2.0  # gaps so wide within a bone are marrow, where the network agrees
@@ -144,11 +144,11 @@ def _is_bone(bone: Tensor, region: _Region) -> Tensor:
     near = _radius(_NEAR_MM, region.spacing)
     brightest = _largest_near(hu.clamp(-200, 1500), near)
     edge = (_SOFT_HU + _EDGE_SHARE * (brightest - _SOFT_HU)).clamp(_LOWEST_EDGE_HU, _HIGHEST_EDGE_HU)
-    word = ((hu - edge) / _SOFTNESS_HU).clamp(-1, 1)
+    evidence = ((hu - edge) / _SOFTNESS_HU).clamp(-1, 1)
     metal = hu > _METAL_HU
     if bool(metal.any()):
-        word[_largest_near(metal.float(), _radius(_METAL_MM, region.spacing)) > 0] = 0
-    return (bone - 0.5) + _CT_WEIGHT * word > 0
+        evidence[_largest_near(metal.float(), _radius(_METAL_MM, region.spacing)) > 0] = 0
+    return (bone - 0.5) + _CT_WEIGHT * evidence > 0
 
 
 def _radius(mm: float, spacing: NDArray[np.float64]) -> tuple[int, int, int]:

@@ -27,11 +27,11 @@ def report_page(case: Case, scene: Scene, result: Result, errors: dict[str, Any]
     comes from files is escaped, and the page's policy lets the browser run its own scripts, show pictures that stand
     within it, and load nothing.
     """
-    environment = _environment()
+    templates = templates_of("femoreg_torch.evaluation.report")
     material = Material(case, scene, result, errors, drawn)
     made = (make(material) for make in SECTIONS)
-    scripts = [Markup(_source(name)) for name in _SCRIPTS]
-    return environment.get_template("report.html").render(
+    scripts = [source_of(templates, name) for name in _SCRIPTS]
+    return templates.get_template("report.html").render(
         title=case.folder.resolve().name,
         side=case.side,
         views=len(case.views),
@@ -39,16 +39,17 @@ def report_page(case: Case, scene: Scene, result: Result, errors: dict[str, Any]
         notice=NOTICE,
         card=card(case, result, {name: thing.reference_point for name, thing in scene.objects.items()}),
         sections=[section for section in made if section is not None],
-        style=Markup(_source("report.css")),
+        style=source_of(templates, "report.css"),
         scripts=scripts,
         policy=f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {script_hashes(scripts)}",
     )
 
 
 @cache
-def _environment() -> jinja2.Environment:
+def templates_of(package: str) -> jinja2.Environment:
+    """The folder `templates` of a package. Whatever is put into them is escaped."""
     return jinja2.Environment(
-        loader=jinja2.PackageLoader("femoreg_torch.evaluation.report"),
+        loader=jinja2.PackageLoader(package),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -56,11 +57,10 @@ def _environment() -> jinja2.Environment:
     )
 
 
-def _source(name: str) -> str:
+def source_of(templates: jinja2.Environment, name: str) -> Markup:
     """The text of a file in the folder of the templates, as it stands there."""
-    loader, environment = _environment().loader, _environment()
-    assert loader is not None
-    return loader.get_source(environment, name)[0]
+    assert templates.loader is not None
+    return Markup(templates.loader.get_source(templates, name)[0])
 
 
 def script_hashes(scripts: Sequence[str]) -> str:
