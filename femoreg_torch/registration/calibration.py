@@ -3,13 +3,14 @@
 Images without and with a device are taken from one C-arm pose, so that all but the device is the same in both. Let Iₐ
 and I_d be their intensities and S the light that is scattered into a pixel; then
 
-    I_d = g · ((Iₐ − S) · exp(−Σ a ℓ) + S)
+    I_d = g · ((Iₐ − S) · (1 + h Σ a ℓ)^(−1/h) + S)
 
-with the path ℓ through each region of the device, its attenuation a, and a factor g between the exposures. Beer–Lambert
-with an additive scatter, as in Seibert and Boone, X-ray scatter removal by deconvolution, Med Phys 15 (1988) 567. Where
-metal is opaque the shadow is S, whatever the metal, so that its darkest places tell S, and lighter ones the
-attenuation. The device's pose is estimated with all that, as a wrong pose looks like a wrong material, and the other
-way round. This least squares is sparse and runs on the CPU, with SciPy, wherever the scene lies.
+with the path ℓ through each region of the device, its attenuation a where it is thin, a factor g between the exposures,
+and the hardening h of the beam in it (`registration.imaging.hardened`). The additive scatter is that of Seibert and
+Boone, X-ray scatter removal by deconvolution, Med Phys 15 (1988) 567. Where metal is opaque the shadow is S, whatever
+the metal, so that its darkest places tell S, and lighter ones the attenuation. The device's pose is estimated with all
+that, as a wrong pose looks like a wrong material, and the other way round. This least squares is sparse and runs on the
+CPU, with SciPy, wherever the scene lies.
 """
 
 import math
@@ -24,7 +25,7 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from femoreg_torch.case.trace import StageRecord
-from femoreg_torch.drr import CPU, project_with_jacobian
+from femoreg_torch.drr import CPU, project, project_with_jacobian
 from femoreg_torch.geometry import (
     Camera,
     Poses,
@@ -55,9 +56,14 @@ _LEAST_PATH_MM = 0.3  # of a ray through the device, for its pixel to count
 _LEAST_PIXELS = 100  # of a view that counts
 _AROUND_MM = 3.0  # on the detector: pixels beyond the shadow that count, so that the device may move
 _START_ATTENUATION = 0.2  # 1/mm: titanium at 80 keV
+_FAINTEST = 1e-3  # 1/mm
 _MOST_ATTENUATION = 2.5  # 1/mm: steel at 45 keV, of which 2 mm are opaque
 _VARIATION = 5.0  # weight of a step of 1/mm between all blocks
 _FLAT = 0.01  # 1/mm: steps that are none
+_TOLD_WITHIN = (
+    0.3  # standard deviation of the logarithm of a named material's attenuation: no file tells the tube's voltage
+)
+_TOLD_WEIGHT = 1 / 200  # of one named material beside all pixels, whose misfits are alike over wide regions
 _MISFIT = 0.05  # of a logarithm of intensity; larger ones (something else has changed) count less
 _FEWEST_ROUNDS, _MOST_ROUNDS = 2, 4  # for blocks, and again for materials
 _STILL = np.array([0.25] * 3 + [0.15] * 3)  # units of the pose: a round that moves it less is the last
@@ -65,6 +71,15 @@ _ITERATIONS, _FEWER = 200, 40  # of L-BFGS from nothing, and from the round befo
 _TWIST = np.array([0.01] * 3 + [1.0] * 3)  # rad and mm: one unit of the pose
 _MOST_DEG, _MOST_MM = 8.0, 12.0  # that the device may move; more means that the images do not show it as it is
 _AS_NAMED = 0.3  # logarithm: one material so near to what the case names is that
+# Squared coefficient of variation of metal's attenuation over the spectrum of a tube at 75 kV, behind 200 mm of water:
+# 0.35, by the tables of `volume.materials`, 0.22 at 60 kV and 0.5 at 100 kV. Thick metal, which lets the hardest light
+# through, hardens the beam by less than the law of `hardened` says: 5 mm of steel as if it were 0.1.
+_HARDENING = 0.25
+_DARK = (
+    0.3  # of the light: pixels behind so much metal tell the scattered light; of a view there must be as many as count
+)
+_LEAST_SCATTER, _MOST_SCATTER = 0.02, 1.0  # per primary light
+_LEAST_PASSING = 1e-3  # of 1 + h Σ a ℓ, where a motion of the device takes its path below nothing
 _CORNERS = 4  # of the box around the device: scattered light is interpolated between them
 
 
@@ -96,11 +111,13 @@ class Calibration:
                 told.append(f"{name} not estimated, as it would have moved by {deg:.0f}° and {mm:.0f} mm")
                 continue
             unsure = tuple(difference.to(scene.device) for difference in fit.unsure)
-            found = replace(thing, volume=fit.volume.to(scene.device), unsure=unsure)
-            scene = replace(scene, objects=scene.objects | {name: found})
+            found = replace(thing, volume=fit.volume.to(scene.device), hardening=_HARDENING, unsure=unsure)
+            objects = scene.objects | {name: found}
+            scene = replace(scene, objects=objects, scatter=scene.scatter | fit.scatter)
             poses = poses.with_object(name, fit.camera1_from)
             moving.append(name)
             told.append(f"{name}: {', '.join(f'{a:.2f}' for a in fit.attenuations)}/mm")
+            told += [f"scatter {ratio:.2f} in view {view + 1}" for view, ratio in fit.scatter.items()]
             cost, evaluations = fit.misfit, evaluations + fit.evaluations
         seconds = time.perf_counter() - began
         return scene, StageRecord(
@@ -122,7 +139,7 @@ class DeviceFit:
     volume: Volume  # attenuation, 1/mm
     camera1_from: Tensor  # (4, 4)
     attenuations: tuple[float, ...]  # 1/mm, of its materials
-    scattered: dict[int, float]  # S by view, in units of the image without the device
+    scatter: dict[int, float]  # per primary light but for the bones, by view (from 0), where the shadow is dark enough
     misfit: float  # median difference of the logarithms of intensity
     evaluations: int
     unsure: tuple[Volume, ...]  # see `RigidObject`: blocks at the borders of materials, taken for the wrong one
@@ -145,7 +162,7 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
     borders = None
     if thing.materials_known and len(thing.parts) > 1:
         owner, attenuation = _told(thing.parts)
-        device = _device(name, kind, share, owner, len(attenuation))
+        device = _device(name, kind, share, owner, len(attenuation), told=attenuation)
         seen = _views(scene, poses, device)
         if not seen:
             return None
@@ -173,11 +190,33 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
         scene.objects[name].volume if as_named else device.filled(attenuation),
         poses.camera1_from[name],
         tuple(attenuation.tolist()),
-        {v.view: float((v.corners @ fit[_scatter_of(n, device.regions)]).mean()) for n, v in enumerate(seen)},
+        _scatter_ratios(scene, poses, seen, fit, device.regions),
         float(np.median(misfit)),
         evaluations + used,
         () if borders is None else mistakes(share, borders, attenuation),
     )
+
+
+def _scatter_ratios(scene: Scene, poses: Poses, seen: list["_View"], fit: Doubles, regions: int) -> dict[int, float]:
+    """Scattered light per primary light behind all but what is drawn without the device, by view (from 0).
+
+    The median over pixels behind enough metal; views with too few of them are left out.
+    """
+    found = {}
+    for n, view in enumerate(seen):
+        dark = view.paths @ fit[:regions] > -math.log(_DARK)
+        if dark.sum() < _LEAST_PIXELS:
+            continue
+        camera = poses.camera(view.view, _LEVEL.camera(scene.carm.camera))
+        names = scene.shown(poses.camera1_from, scene.first_kind)
+        placed = torch.stack([poses.camera_from(name)[view.view] for name in names])[None]
+        bones = project([scene.objects[name].volume.to(CPU) for name in names], placed, camera, _LEVEL.step_mm)
+        drawn = bones.flatten().double().numpy()[view.pixels]
+        scattered = view.corners @ fit[_scatter_of(n, regions)]
+        primary = np.maximum(view.without - scattered, 1e-3 * view.without) * np.exp(drawn)
+        ratio = float(np.median((scattered / primary)[dark]))
+        found[view.view] = min(max(ratio, _LEAST_SCATTER), _MOST_SCATTER)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +230,7 @@ class _Device:
     regions: int
     voxels: RegionVoxels
     touching: Indices | None  # (n, 3): pairs of regions, and the faces between them
+    told: Doubles | None  # (regions,) attenuations that the case names
 
     def filled(self, attenuation: Doubles) -> Volume:
         """Its attenuation, 1/mm, from that of its regions."""
@@ -199,9 +239,15 @@ class _Device:
 
 
 def _device(
-    name: str, kind: Kind, share: Volume, owner: Tensor, regions: int, touching: Indices | None = None
+    name: str,
+    kind: Kind,
+    share: Volume,
+    owner: Tensor,
+    regions: int,
+    touching: Indices | None = None,
+    told: Doubles | None = None,
 ) -> _Device:
-    return _Device(name, kind, share, owner, regions, region_voxels(share, owner, regions), touching)
+    return _Device(name, kind, share, owner, regions, region_voxels(share, owner, regions), touching, told)
 
 
 def _settled(
@@ -248,6 +294,7 @@ class _View:
     """The pixels of one view that the device covers, and those around."""
 
     view: int
+    pixels: Indices  # (N,) of the image of `_LEVEL`
     paths: csr_array  # (N, K) mm through each region
     changes: Doubles  # (N, 6) of the path · attenuation by a twist, in units of `_TWIST`
     without: Doubles  # (N,) intensities
@@ -288,7 +335,7 @@ def _views(
             changes = (jacobian[0].flatten(0, 1)[chosen].double() @ turn).numpy() * _TWIST
         if chosen_views is not None or len(chosen) >= _LEAST_PIXELS:
             without, with_it = (values[chosen] for values in intensities)
-            seen.append(_View(view, paths[chosen], changes, without, with_it, _corners(chosen, camera)))
+            seen.append(_View(view, chosen, paths[chosen], changes, without, with_it, _corners(chosen, camera)))
     return seen
 
 
@@ -307,7 +354,8 @@ def _solve(seen: list[_View], device: _Device, begin: Doubles, iterations: int) 
     """Attenuations (K), scattered light (4 V), log factors between the exposures (V), a twist (6); and evaluations.
 
     Least squares of the logarithms of intensity, robust, plus, over the faces between `touching` regions, the total
-    variation of the attenuation, as a device is of few materials (Rudin, Osher, Fatemi, Physica D 60 (1992) 259).
+    variation of the attenuation, as a device is of few materials (Rudin, Osher, Fatemi, Physica D 60 (1992) 259), and
+    how far the attenuations are from those that the case names.
     """
     views, regions, touching = len(seen), device.regions, device.touching
     darkest = np.repeat([_darkest(view) for view in seen], _CORNERS)
@@ -336,6 +384,10 @@ def _solve(seen: list[_View], device: _Device, begin: Doubles, iterations: int) 
             value += (share * (soft - _FLAT)).sum()
             np.add.at(slope, one, share * step / soft)
             np.add.at(slope, other, -share * step / soft)
+        if device.told is not None:
+            off = np.log(np.maximum(x[:regions], _FAINTEST) / device.told) / _TOLD_WITHIN
+            value += 0.5 * _TOLD_WEIGHT * (off**2).sum()
+            slope[:regions] += _TOLD_WEIGHT * off / (_TOLD_WITHIN * np.maximum(x[:regions], _FAINTEST))
         return value, slope * unit
 
     bounds = list(zip(lowest / unit, highest / unit, strict=True))
@@ -364,7 +416,10 @@ def _residual(x: Doubles, seen: list[_View], n: int, regions: int) -> tuple[Doub
     view = seen[n]
     gain = x[regions + _CORNERS * len(seen) + n]
     scatter = view.corners @ x[_scatter_of(n, regions)]
-    light = np.exp(-(view.paths @ x[:regions] + view.changes @ x[-6:]))
+    integrals = view.paths @ x[:regions] + view.changes @ x[-6:]
+    passing = np.maximum(1 + _HARDENING * integrals, _LEAST_PASSING)
+    light = passing ** (-1 / _HARDENING)
     primary = np.maximum(view.without - scatter, 1e-3 * view.without)
     total = primary * light + scatter
-    return np.log(view.with_it) - gain - np.log(total), primary * light / total, -(1 - light) / total
+    by_path = primary * light / passing / total
+    return np.log(view.with_it) - gain - np.log(total), by_path, -(1 - light) / total

@@ -6,10 +6,17 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from femoreg_torch.drr import project, project_with_jacobian
+from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, Poses, transform_points, twist_rates
 from femoreg_torch.optimize import Quadratic, SmoothObjective
-from femoreg_torch.registration.imaging import PLAIN, Imaging, tissue_integrals
+from femoreg_torch.registration.imaging import (
+    PLAIN,
+    Imaging,
+    draw,
+    draw_with_jacobian,
+    hardened_slope,
+    tissue_integrals,
+)
 from femoreg_torch.registration.intrinsics import PRIOR_WEIGHT, Intrinsics
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.scene import Body, Kind, Moving, RigidObject, Scene, split
@@ -77,10 +84,12 @@ def _target(
     background = torch.zeros(camera.shape, device=scene.device)
     if still:
         where = torch.stack([poses.camera_from(name)[view] for name in still])[None]
-        background = project([scene.objects[name].volume for name in still], where, camera, level.step_mm)[0]
+        background = draw([scene.objects[name] for name in still], where, camera, level.step_mm)[0]
     placing = [name for body in rigid for name in body.objects]
     looked_at = pixel_weights(scene, poses, render, placing, image, camera, level.step_mm, weights)
     fixed = prepared(scene, image, level, similarity, looked_at)
+    if imaging.scatter:
+        imaging = replace(imaging, scatter=scene.scatter.get(view, imaging.scatter))
     tissue = None
     if imaging.tissue and scene.tissue is not None:
         tissue = imaging.tissue * tissue_integrals(scene.tissue, poses.camera_from(scene.anchor)[view], camera)
@@ -163,9 +172,9 @@ class ImageCosts:
                     names, moving = (), torch.zeros(())
                 left = [name for name in target.moving if name not in names]
                 if left:
-                    volumes = [self.objects[name].volume for name in left]
+                    things = [self.objects[name] for name in left]
                     placed = self._placed(target, deltas, motions, left)
-                    moving = moving + project(volumes, placed, self._camera(target, deltas), self.step_mm)
+                    moving = moving + draw(things, placed, self._camera(target, deltas), self.step_mm)
                 drawn[target.view] = target.moving, moving
                 image = image + moving
             costs.append(target.cost(image))
@@ -238,9 +247,8 @@ class ImageCosts:
         for name, pose in zip(target.moving, poses, strict=True):
             if (target.view, name) not in seen:
                 centre = transform_points(pose, self.objects[name].reference_point[None])[0]
-                volume = self.objects[name].volume
-                seen[target.view, name] = project_with_jacobian(
-                    volume, pose[None], camera, centre, self.step_mm, intrinsics=bool(refining)
+                seen[target.view, name] = draw_with_jacobian(
+                    self.objects[name], pose[None], camera, centre, self.step_mm, intrinsics=bool(refining)
                 )
             image, jacobian = seen[target.view, name]
             drawn = drawn + image[0]
@@ -254,7 +262,8 @@ class ImageCosts:
         for name, difference in unsure:
             if name in target.moving:
                 place = poses[target.moving.index(name)][None, None]
-                jacobians.append(project([difference], place, camera, self.step_mm))
+                change = project([difference], place, camera, self.step_mm)
+                jacobians.append(change * hardened_slope(seen[target.view, name][0], self.objects[name].hardening))
         changes = torch.cat(jacobians) * target.imaging.slope(drawn)
         return target.similarity, target.seen(drawn), changes.movedim(0, -1)
 

@@ -36,6 +36,7 @@ class RigidObject:
     classes: tuple[int, ...] = ()  # of the segmentation that show it; none for what the network does not know
     parts: tuple[Volume, ...] = ()  # of a model, each of one material; on the grid of `volume`, which is their sum
     materials_known: bool = False  # whether materials were named; the HU of a single solid may be a guess
+    hardening: float = 0.0  # of the beam in it, see `registration.imaging.hardened`
     # differences of attenuation, 1/mm, of what was estimated: each comes in with an amount of mean 0 and variance 1
     unsure: tuple[Volume, ...] = ()
 
@@ -80,6 +81,7 @@ class Scene:
     tissue: Volume | None = None  # attenuation of the soft tissue, 1/mm, in the space of `anchor`
     outline: Outline | None = None  # what checks the start, in the space of `anchor`
     camera_from_camera1: Tensor | None = None  # (V, 4, 4) where the C-arm's poses are known and stay; None: to be found
+    scatter: dict[int, float] = field(default_factory=dict)  # of views (from 0), see `Imaging`, where it was estimated
     left_on_left: tuple[int, ...] = ()  # views (from 0) seen from behind the patient: left is left
     missing: tuple[str, ...] = ()  # what the case lacks and what shutters hide, in words
 

@@ -5,14 +5,15 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+import scipy.stats
 import torch
 from registration_scenes import REFERENCE_POINTS, VOLUMES, float64, make_scene, off, segmentations, true_poses
 
-from femoreg_torch.registration import objective
-from femoreg_torch.registration.imaging import PLAIN, Imaging
+from femoreg_torch.registration import imaging as drawing
+from femoreg_torch.registration.imaging import PLAIN, Imaging, hardened, hardened_slope
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import Prior, image_costs, stage_objective
-from femoreg_torch.registration.scene import Body, reference_point_in_view
+from femoreg_torch.registration.scene import Body, Scene, reference_point_in_view
 from femoreg_torch.registration.weights import Weighting
 from femoreg_torch.similarity import GradNcc, Ncc, Similarity
 
@@ -29,7 +30,9 @@ def _joint_objective(  # type: ignore[no-untyped-def]
 ):
     """Every object and every C-arm but the first free, a little off the truth."""
     poses = true_poses()
-    scene = replace(make_scene(poses), segmentations=segmentations(poses), tissue=VOLUMES["femur"])
+    scene = replace(make_scene(poses), segmentations=segmentations(poses), tissue=VOLUMES["femur"], scatter={1: 0.2})
+    metal = replace(scene.objects["device"], hardening=0.3)
+    scene = replace(scene, objects=scene.objects | {"device": metal})
     for name, point in REFERENCE_POINTS.items():
         poses = poses.with_object(name, off(poses.camera1_from[name], point, (0.5, -0.4, 0.6), (0.5, 0.4, -2)))
     objects = tuple(
@@ -93,6 +96,34 @@ def test_scatter_fills_dark_shadows() -> None:
     assert torch.allclose(slope, Imaging(scatter=0.25).slope(integrals.detach()))
 
 
+@pytest.mark.parametrize("hardening", [0.05, 0.35])
+def test_metal_hardens_the_beam_as_a_spectrum_of_attenuations_does(hardening: float) -> None:
+    """Of attenuations spread as a gamma distribution, whose squared coefficient of variation is h, by quadrature."""
+    integrals = torch.tensor([0.0, 0.3, 2.0, 6.0], dtype=torch.float64, requires_grad=True)
+    spectrum = scipy.stats.gamma(1 / hardening, scale=hardening)  # mean 1
+    expected = [-math.log(spectrum.expect(lambda a, path=path: math.exp(-a * path))) for path in integrals.tolist()]
+    seen = hardened(integrals, hardening)
+    assert seen.tolist() == pytest.approx(expected, abs=1e-6)
+    slope = torch.autograd.grad(seen.sum(), integrals)[0]
+    assert torch.allclose(slope, hardened_slope(seen.detach(), hardening))
+    assert hardened(integrals, 0) is integrals
+
+
+def test_scatter_that_was_estimated_stands_in_for_that_of_the_preset() -> None:
+    poses = true_poses()
+    scene, nothing = make_scene(poses), torch.zeros(1, 0, dtype=torch.float64)
+
+    def costs(scene: Scene, scatter: float) -> torch.Tensor:
+        images = [("anatomy", 0), ("anatomy", 1)]
+        of_images = image_costs(scene, poses, (), ("pelvis",), images, _LEVEL, _SIMILARITY, (), Imaging(scatter))
+        return of_images(nothing)[0]
+
+    told, estimated = costs(scene, 0.3), costs(replace(scene, scatter={1: 1.0}), 0.3)
+    assert estimated[0] == told[0]
+    assert estimated[1] == costs(scene, 1.0)[1] != told[1]
+    assert torch.equal(costs(replace(scene, scatter={1: 1.0}), 0.0), costs(scene, 0.0))  # none was asked for
+
+
 def test_a_scene_without_soft_tissue_draws_none() -> None:
     poses = true_poses()
     nothing = torch.zeros(1, 0, dtype=torch.float64)
@@ -119,17 +150,17 @@ def test_what_two_images_of_a_view_show_alike_is_drawn_once(monkeypatch: pytest.
         torch.testing.assert_close(one.hessian, alone.hessian)
     drawn: list[str] = []
     for name in ("project", "project_with_jacobian"):
-        whole = getattr(objective, name)
+        whole = getattr(drawing, name)
 
         def counted(*arguments: Any, name: str = name, whole: Any = whole, **options: Any) -> Any:
             drawn.append(name)
             return whole(*arguments, **options)
 
-        monkeypatch.setattr(objective, name, counted)
+        monkeypatch.setattr(drawing, name, counted)
     together.quadratics(deltas[0])
     assert drawn == ["project_with_jacobian"] * 6  # three objects in two views
     drawn.clear()
     anatomy_first = image_costs(scene, poses, bodies, render, sorted(images), _LEVEL, _SIMILARITY)
     drawn.clear()
     anatomy_first(deltas)
-    assert drawn == ["project"] * 4  # the bones of two views, then the device in each
+    assert drawn == ["project"] * 6  # two bones in two views, then the device in each
