@@ -311,11 +311,11 @@ def places(
     rise = settings.strength_mpa * model.fill - model.material.tension
     alone = mechanisms[0].load_n
     base, worth = [], []
-    field = np.zeros(model.grid.shape)
+    field = np.zeros((*model.grid.shape, 8))
     for each in mechanisms:
         load, more = each.bound(model.material.tension, rise)
         field[tuple(model.mesh.cells.T)] = more / alone
-        density = grid.mean(model.grid.spread(field) * bone.marrow)[where]  # per element's volume
+        density = grid.mean(model.grid.spread_octants(field) * bone.marrow)[where]  # per octant's volume
         base.append(load / alone)
-        worth.append(density * (size_mm / model.mesh.size_mm) ** 3 / room_ml)
+        worth.append(density * 8 * (size_mm / model.mesh.size_mm) ** 3 / room_ml)
     return Worth(grid.centres(index), room_ml, np.array(base), np.array(worth))

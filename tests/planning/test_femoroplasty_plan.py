@@ -151,7 +151,7 @@ def test_a_mechanism_bounds_what_cement_can_bear(prepared: Prepared, plan: Femor
     ways = [mechanism(curve, material) for curve, material in zip(curves, with_it, strict=True)]
     for own, way in enumerate(ways):
         alone, more = way.bound(model.material.tension, rise)
-        bounds = [alone + float(more @ model.cement_share(share)) for share in placed]
+        bounds = [alone + float((more * model.cement_share(share)).sum()) for share in placed]
         assert bounds[own] == pytest.approx(loads[own], rel=0.02)  # voxels mix before they are averaged
         for bound, load in zip(bounds, loads, strict=True):
             assert bound > 0.8 * load  # yield comes before the limit load, so it is a bound only about
@@ -160,7 +160,7 @@ def test_a_mechanism_bounds_what_cement_can_bear(prepared: Prepared, plan: Femor
     assert worth.base[0] == pytest.approx(1.0)
     everywhere = worth.base[0] + worth.worth[0] @ worth.room_ml  # all of the marrow
     alone, more = ways[0].bound(model.material.tension, rise)
-    filled = alone + float(more @ model.cement_share(bone.marrow.astype(float)))
+    filled = alone + float((more * model.cement_share(bone.marrow.astype(float))).sum())
     assert everywhere == pytest.approx(filled / loads[0], rel=0.05)
 
 
