@@ -113,6 +113,20 @@ def test_a_finer_mesh_carries_a_similar_load(solids: Solids, planning: Planning,
     assert found.yield_load_n == pytest.approx(curve.yield_load_n, rel=0.15)
 
 
+def test_the_load_hardly_hangs_on_where_elements_fall(solids: Solids, planning: Planning, curve: Curve) -> None:
+    """A box with two voxels less at its right and front moves all elements by 2 of their 6 mm to the left and back."""
+    ct, labels, head = solids
+    femur = cut_out(ct, labels, 1, head, "left", planning.mesh.shaft_mm)
+    affine = femur.lps_from_index.copy()
+    affine[:3, 3] += affine[:3, :3] @ [2.0, 2.0, 0.0]
+    moved = dataclasses.replace(femur, hu=femur.hu[2:, 2:], mask=femur.mask[2:, 2:], lps_from_index=affine)
+    assert moved.mask.sum() == femur.mask.sum()
+    model = make_model(make_bone(moved, UNCALIBRATED, planning), planning, SIZE_MM)
+    machine = Press(model.mesh, make_loading(model, moved, planning.load), planning.bone.poisson)
+    found = machine.curve(model.material, planning.curve)
+    assert found.yield_load_n == pytest.approx(curve.yield_load_n, rel=0.03)
+
+
 @pytest.mark.parametrize("rule", ["displacement", "pistoia"])
 def test_other_rules_of_the_yield_load(press: tuple[Model, Press], planning: Planning, curve: Curve, rule: str) -> None:
     model, machine = press
