@@ -69,7 +69,7 @@ def blocks(femur: Femur, size_mm: float) -> Blocks:
 
     So the blocks of a mirrored femur are the mirrored blocks.
     """
-    extent = femur.mask.shape * femur.spacing
+    extent = np.array(femur.mask.shape) * femur.spacing
     count = np.ceil(extent / size_mm - 1e-9).astype(int)
     corner = (extent - count * size_mm) / 2
     affine = np.eye(4)
@@ -140,7 +140,7 @@ class Mesh:
         within = np.clip(places[point] - self.cells[element], 0.0, 1.0)
         shares = np.stack([np.where(corner, within, 1 - within).prod(1) for corner in CORNERS], axis=1)
         shares *= (amounts / near.sum(1))[point, None]
-        return np.bincount(self.elements[element].ravel(), shares.ravel(), len(self.nodes))
+        return np.asarray(np.bincount(self.elements[element].ravel(), shares.ravel(), len(self.nodes)), float)
 
 
 def mesh_of(size_mm: float, kept: NDArray[np.bool_], axes: Array, origin: Array) -> Mesh:
