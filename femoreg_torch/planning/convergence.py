@@ -33,8 +33,8 @@ def on_mesh(prepared: Prepared, cement: Array, size_mm: float) -> MeshRow:
     """
     bone, planning = prepared.bone, prepared.planning
     model = make_model(bone, planning, size_mm)
-    loading = make_loading(model.mesh, bone.femur.frame, planning.load)
-    press = Press(model.mesh, loading, planning.bone.poisson, planning.load.pad_modulus_mpa)
+    loading = make_loading(model, bone.femur, planning.load)
+    press = Press(model.mesh, loading, planning.bone.poisson)
     other = dataclasses.replace(prepared, model=model, press=press)
     began = time.process_time()
     without = other.curve().yield_load_n

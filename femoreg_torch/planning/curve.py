@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.planning.element import elastic_stiffness
+from femoreg_torch.planning.element import TENSOR, elastic_stiffness, moduli, template
 from femoreg_torch.planning.laws import Material
 from femoreg_torch.planning.loading import Loading
 from femoreg_torch.planning.mesh import Mesh
@@ -42,7 +42,7 @@ class Curve:
     yield_load_n: float
     yield_mm: float
     yield_energy_nmm: float  # area below the curve up to there
-    plastic: Array  # (E,) equivalent plastic strain at the end, mean of the Gauss points
+    plastic: Array  # (E, 8) equivalent plastic strain at the end
     last: Point
     newton: int
 
@@ -55,35 +55,36 @@ class Curve:
 class Press:
     """A femur under its pads: mesh, loading and the pattern of the matrix, which serve any material."""
 
-    def __init__(self, mesh: Mesh, loading: Loading, poisson: float, cap_modulus_mpa: float) -> None:
+    def __init__(self, mesh: Mesh, loading: Loading, poisson: float) -> None:
         self.mesh, self.loading = mesh, loading
-        self._poisson, self._cap_modulus = poisson, cap_modulus_mpa
+        self._poisson = poisson
         self._assembler = Assembler(mesh)
 
     def hardened(self, material: Material) -> Material:
         """The material with caps that do not yield and are no softer than the pads."""
         caps = self.loading.caps
-        never = np.full(len(caps), np.inf)
         return Material(
-            np.where(caps, np.maximum(material.modulus, self._cap_modulus), material.modulus),
-            np.where(caps, never, material.tension),
-            np.where(caps, never, material.compression),
+            np.maximum(material.modulus, self.loading.cap_modulus),
+            np.where(caps, np.inf, material.tension),
+            np.where(caps, np.inf, material.compression),
         )
 
     def elastic(self, material: Material) -> tuple[Array, float, Solver]:
         """Displacements (N, 3) for a pad moved by 1 mm, the stiffness N/mm, and the solver that found them."""
         hard = self.hardened(material)
-        unit = elastic_stiffness(self._poisson)
-        matrix = self._assembler.matrix(unit, self.loading.springs, hard.modulus * self.mesh.size_mm)
+        stiffness = elastic_stiffness(hard.modulus, self._poisson) * self.mesh.size_mm
+        matrix = self._assembler.matrix(stiffness, self.loading.springs)
         solver = Solver(matrix, self.mesh.nodes)
         u = solver.solve(matrix, self.loading.push(1.0).ravel(), _LINEAR_TOLERANCE).reshape(-1, 3)
         return u, self.loading.load(1.0, u), solver
 
     def energy(self, material: Material, u: Array) -> Array:
-        """Elastic strain energy (E,) of elements at displacements (N, 3), N mm."""
-        local = self._assembler.gather(u)
-        forces = local @ elastic_stiffness(self._poisson)
-        return np.asarray(0.5 * (forces * local).sum(1) * self.hardened(material).modulus * self.mesh.size_mm)
+        """Elastic strain energy (E, 8) of the eighths of elements at displacements (N, 3), N mm."""
+        strained = self._assembler.gather(u) / self.mesh.size_mm
+        made, (bulk, shear) = template(), moduli(self._poisson)
+        deviator = (strained @ made.deviator.reshape(48, 24).T).reshape(-1, 8, 6)
+        density = bulk / 2 * (strained @ made.dilatation)[:, None] ** 2 + shear * (deviator**2 @ TENSOR)
+        return np.asarray(density * self.hardened(material).modulus * self.mesh.size_mm**3 / 8)
 
     def curve(self, material: Material, settings: CurveSettings) -> Curve:
         """The curve until the bone has yielded. Raises `InputError` where it does not converge or never yields.
@@ -183,17 +184,16 @@ class Press:
             at_load = float(stiffness * (at - settings.offset_mm))
         below = d < at
         energy = float(np.trapezoid(np.append(load[below], at_load), np.append(d[below], at)))
-        plastic = points[-1].state.equivalent.mean(1)
-        return Curve(d, load, stiffness, at_load, at, energy, plastic, points[-1], newton)
+        return Curve(d, load, stiffness, at_load, at, energy, points[-1].state.equivalent, points[-1], newton)
 
     def _pistoia(self, material: Material, unit: Array, stiffness: float, settings: CurveSettings) -> float:
         """The load at which a share of the volume exceeds a strain, by the linear solution (Pistoia et al. 2002).
 
         Strain is the energy-equivalent sqrt(2 U / E) with U the energy density.
         """
-        modulus = self.hardened(material).modulus
-        strain = np.sqrt(2 * self.energy(material, unit) / (modulus * self.mesh.size_mm**3))
-        strain = strain[~self.loading.caps]
+        modulus = self.hardened(material).modulus.mean(1)
+        strain = np.sqrt(2 * self.energy(material, unit).sum(1) / (modulus * self.mesh.size_mm**3))
+        strain = strain[~self.loading.caps.any(1)]
         return float(stiffness * settings.pistoia_strain / np.quantile(strain, 1 - settings.pistoia_share))
 
 

@@ -20,18 +20,18 @@ class Mechanism:
     """A way in which a femur gives way, and the load at which it did, with the cement that it then held."""
 
     load_n: float
-    plastic: Array  # (E,) plastic strain at the end of the curve
-    strength: Array  # (E,) MPa, with the cement
+    plastic: Array  # (E, 8) plastic strain at the end of the curve
+    strength: Array  # (E, 8) MPa, with the cement
 
     def bound(self, bone_strength: Array, gain: Array) -> tuple[float, Array]:
-        """The most that any femur can bear before it gives way in this way: what bone alone bears, N, and more (E,).
+        """The most that any femur can bear before it gives way in this way: what bone alone bears, N, and more (E, 8).
 
-        The second is what replacing all of an element by cement adds, `gain` (E,) being its rise of strength. By the
+        The second is what replacing all of an eighth by cement adds, `gain` (E, 8) being its rise of strength. By the
         kinematic theorem of plastic collapse no cement helps beyond the least of such bounds: the load of a mechanism
         is the work that strength does on its strains, which is linear in where cement is.
         """
-        per_work = self.load_n / float(self.strength @ self.plastic)
-        return per_work * float(bone_strength @ self.plastic), per_work * gain * self.plastic
+        per_work = self.load_n / float((self.strength * self.plastic).sum())
+        return per_work * float((bone_strength * self.plastic).sum()), per_work * gain * self.plastic
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def optimise(
             u = press.elastic(material)[0]
             stiffer = np.maximum(planning.cement.modulus_mpa * model.fill / material.modulus - 1, 0)
             gain = press.energy(material, u) * stiffer
-        gain = np.where(press.loading.caps, 0.0, gain)
+        gain = np.where(press.loading.caps, 0.0, gain).mean(1)
         wanted = _smoothed(model, gain, room > 0, settings.filter_mm)
         _place(placed, room, wanted, volume_ml / settings.steps)
         share = np.clip(grid.spread(placed), 0, 1) * bone.marrow

@@ -44,11 +44,20 @@ def moduli(poisson: float) -> tuple[float, float]:
     return 1 / (3 * (1 - 2 * poisson)), 1 / (2 * (1 + poisson))
 
 
-def elastic_stiffness(poisson: float) -> Array:
-    """Stiffness (24, 24) of the cube of edge 1 for a Young's modulus of 1; of edge h and modulus E: h E times that."""
+def elastic_stiffness(modulus: Array, poisson: float) -> Array:
+    """Stiffness (E, 24, 24) of cubes of edge 1, Young's moduli (E, 8) at their Gauss points; edge h: h times it."""
     bulk, shear = moduli(poisson)
+    return stiffness(bulk * modulus, shear * modulus)
+
+
+def stiffness(bulk: Array, shear: Array) -> Array:
+    """The same, for bulk and shear moduli (E, 8).
+
+    Dilatation is the same in the whole cube, so its stiffness is that of the mean bulk modulus.
+    """
     made = template()
-    return np.asarray(bulk * made.volumetric + shear * made.shear.sum(0))
+    found = shear @ made.shear.reshape(8, 576) + bulk.mean(1)[:, None] * made.volumetric.reshape(1, 576)
+    return np.asarray(found.reshape(-1, 24, 24))
 
 
 def _strain(point: Array) -> Array:

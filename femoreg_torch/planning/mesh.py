@@ -1,14 +1,15 @@
 """Hexahedra over a bone: which there are, their nodes, and what voxels of the CT each averages.
 
-Properties are mapped voxel by voxel at the CT's resolution and then averaged, and elements at the surface that are
-filled only in part are kept with diluted properties. Density averaged first, and whole elements at the surface, turn
-the mesh size into a factor of two in what cement gains.
+Properties are mapped voxel by voxel at the CT's resolution and then averaged over the eighth of an element around each
+Gauss point, and elements at the surface that are filled only in part are kept. Density averaged first, and whole
+elements at the surface, turn the mesh size into a factor of two in what cement gains.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.element import CORNERS
@@ -24,19 +25,30 @@ class Blocks:
 
     size_mm: float
     shape: tuple[int, int, int]
-    overlap: tuple[Array, Array, Array]  # for each axis (B, V), mm that blocks and voxels have in common
+    overlap: tuple[Array, ...]  # for each axis (B, V), mm that blocks and voxels have in common
+    half_overlap: tuple[Array, ...]  # (2B, V) the same of halves of blocks
     spacing: Array  # (3,) mm of the voxels
     lps_from_mm: Array  # (4, 4) takes mm along the index axes, from the first block's corner, to LPS
 
     def mean(self, values: NDArray) -> Array:
         """Averages (BX, BY, BZ) of values at voxels (X, Y, Z) over each block; what is beyond the box counts as 0."""
-        x, y, z = (overlap / self.size_mm for overlap in self.overlap)
-        return np.asarray(np.einsum("ax,by,cz,xyz->abc", x, y, z, np.asarray(values, float), optimize=True))
+        return _mean(self.overlap, self.size_mm, values)
+
+    def octants(self, values: NDArray) -> Array:
+        """Averages (BX, BY, BZ, 8) over the eighths of each block, in the order of the corners of an element."""
+        a, b, c = self.shape
+        means = _mean(self.half_overlap, self.size_mm / 2, values).reshape(a, 2, b, 2, c, 2)
+        return np.asarray(means.transpose(0, 2, 4, 1, 3, 5).reshape(a, b, c, 8))
 
     def spread(self, values: NDArray) -> Array:
         """What blocks hold (BX, BY, BZ), at the femur's voxels (X, Y, Z)."""
-        x, y, z = (overlap / edge for overlap, edge in zip(self.overlap, self.spacing, strict=True))
-        return np.asarray(np.einsum("ax,by,cz,abc->xyz", x, y, z, np.asarray(values, float), optimize=True))
+        return _spread(self.overlap, self.spacing, values)
+
+    def spread_octants(self, values: NDArray) -> Array:
+        """The same of what their eighths hold (BX, BY, BZ, 8)."""
+        a, b, c = self.shape
+        apart = np.asarray(values).reshape(a, b, c, 2, 2, 2).transpose(0, 3, 1, 4, 2, 5).reshape(2 * a, 2 * b, 2 * c)
+        return _spread(self.half_overlap, self.spacing, apart)
 
     def centres(self, index: Ints) -> Array:
         """Middles (N, 3), LPS mm, of blocks (N, 3)."""
@@ -57,21 +69,36 @@ def blocks(femur: Femur, size_mm: float) -> Blocks:
 
     So the blocks of a mirrored femur are the mirrored blocks.
     """
-    shape, overlap = [], []
-    corner = np.zeros(3)
-    for axis, spacing in enumerate(femur.spacing):
-        voxels = np.arange(femur.mask.shape[axis])
-        count = int(np.ceil(len(voxels) * spacing / size_mm - 1e-9))
-        corner[axis] = (len(voxels) * spacing - count * size_mm) / 2
-        low = corner[axis] + np.arange(count)[:, None] * size_mm
-        ends = np.minimum(low + size_mm, (voxels + 1) * spacing) - np.maximum(low, voxels * spacing)
-        shape.append(count)
-        overlap.append(np.maximum(ends, 0.0))
+    extent = np.array(femur.mask.shape) * femur.spacing
+    count = np.ceil(extent / size_mm - 1e-9).astype(int)
+    corner = (extent - count * size_mm) / 2
     affine = np.eye(4)
     affine[:3, :3] = femur.axes
     affine[:3, 3] = femur.lps_from_index[:3, 3] - femur.lps_from_index[:3, :3] @ np.full(3, 0.5) + femur.axes @ corner
-    made = (overlap[0], overlap[1], overlap[2])
-    return Blocks(size_mm, (shape[0], shape[1], shape[2]), made, femur.spacing, affine)
+    overlap, half_overlap = (
+        tuple(
+            _overlap(corner[axis], parts * int(count[axis]), size_mm / parts, femur.mask.shape[axis], spacing)
+            for axis, spacing in enumerate(femur.spacing)
+        )
+        for parts in (1, 2)
+    )
+    return Blocks(size_mm, tuple(count.tolist()), overlap, half_overlap, femur.spacing, affine)
+
+
+def _mean(overlap: tuple[Array, ...], size_mm: float, values: NDArray) -> Array:
+    x, y, z = (part / size_mm for part in overlap)
+    return np.asarray(np.einsum("ax,by,cz,xyz->abc", x, y, z, np.asarray(values, float), optimize=True))
+
+
+def _spread(overlap: tuple[Array, ...], spacing: Array, values: NDArray) -> Array:
+    x, y, z = (part / edge for part, edge in zip(overlap, spacing, strict=True))
+    return np.asarray(np.einsum("ax,by,cz,abc->xyz", x, y, z, np.asarray(values, float), optimize=True))
+
+
+def _overlap(corner: float, count: int, size_mm: float, voxels: int, spacing: float) -> Array:
+    """mm (B, V) that blocks in a row, from a corner on, have in common with voxels in a row from 0 on."""
+    low, start = corner + np.arange(count)[:, None] * size_mm, np.arange(voxels) * spacing
+    return np.maximum(np.minimum(low + size_mm, start + spacing) - np.maximum(low, start), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,26 +123,24 @@ class Mesh:
         return np.asarray((self.cells + 0.5) * self.size_mm @ self.axes.T + self.origin)
 
     def of(self, values: Array) -> Array:
-        """Those (E,) of block values (BX, BY, BZ) that belong to elements."""
+        """Those (E, ...) of block values (BX, BY, BZ, ...) that belong to elements."""
         return np.asarray(values[tuple(self.cells.T)])
 
-    def surface(self, direction: Array) -> Array:
-        """Area (N,), mm², that each node bears of the surface which a unit vector (3,) along the index axes looks at.
+    def shared(self, points: Array, amounts: Array) -> Array:
+        """Amounts (M,) at points (M, 3), LPS mm, shared out to the nodes (N,) by the shape functions of their elements.
 
-        Areas are projected along the vector, so that they add up to the true projection however the voxels step.
+        What lies beside the mesh goes to the nearest element, or in equal parts to those that are alike near, so that a
+        mirrored mesh shares alike. Sums stay, and within the mesh first moments too.
         """
-        area = np.zeros(len(self.nodes))
-        taken = np.zeros(self.cells.max(0) + 3, bool)  # a rim of free blocks all around
-        taken[tuple(self.cells.T + 1)] = True
-        for axis in range(3):
-            step = int(np.sign(direction[axis])) or 1
-            share = abs(direction[axis]) * self.size_mm**2 / 4
-            beside = self.cells.copy()
-            beside[:, axis] += step
-            free = ~taken[tuple(beside.T + 1)]
-            face = CORNERS[:, axis] == (step > 0)
-            np.add.at(area, self.elements[free][:, face].ravel(), share)
-        return area
+        places = (points - self.origin) @ self.axes / self.size_mm
+        distance, nearest = cKDTree(self.cells + 0.5).query(places, k=min(8, len(self.cells)))
+        near = distance <= distance[:, :1] + 1e-6
+        point, number = np.nonzero(near)
+        element = nearest[point, number]
+        within = np.clip(places[point] - self.cells[element], 0.0, 1.0)
+        shares = np.stack([np.where(corner, within, 1 - within).prod(1) for corner in CORNERS], axis=1)
+        shares *= (amounts / near.sum(1))[point, None]
+        return np.asarray(np.bincount(self.elements[element].ravel(), shares.ravel(), len(self.nodes)), float)
 
 
 def mesh_of(size_mm: float, kept: NDArray[np.bool_], axes: Array, origin: Array) -> Mesh:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -194,6 +195,20 @@ def covered(
     return filled, nearest, float(least[order[last]])
 
 
+def apart_mm(ellipsoids: Sequence[Ellipsoid]) -> float:
+    """How far injections, from deep to shallow, are from being one body of cement, mm; 0 where they are.
+
+    What is injected at one place spreads to about a ball, whatever its ellipsoid: so balls must touch. A gap of bone
+    between two bodies gives way, and elements as wide as it do not see that.
+    """
+    radii = [(3000 * e.volume_ml / (4 * math.pi)) ** (1 / 3) for e in ellipsoids]
+    gaps = [
+        deep.depth_mm - shallow.depth_mm - a - b
+        for (deep, a), (shallow, b) in pairwise(zip(ellipsoids, radii, strict=True))
+    ]
+    return sum(max(0.0, gap) for gap in gaps)
+
+
 class Planner:
     """The search for a path: its parameters, what they mean, and what they are worth."""
 
@@ -230,7 +245,6 @@ class Planner:
         outside = (
             np.maximum(scaled - settings.most_axis_mm, 0).sum() + np.maximum(settings.least_axis_mm - scaled, 0).sum()
         )
-        value = self._worth.load(room) - 0.1 * float(outside)
         made = [
             Ellipsoid(length * (1 - share), float(axis[0]), float(axis[1]), float(part))
             for share, axis, part in zip(x[5 : 5 + count], scaled, parts, strict=True)
@@ -239,6 +253,7 @@ class Planner:
         made.sort(key=lambda ellipsoid: -ellipsoid.depth_mm)
         whole = sum(e.volume_ml for e in made)
         kept = [Ellipsoid(e.depth_mm, e.along_mm, e.across_mm, e.volume_ml * self._volume / whole) for e in made]
+        value = self._worth.load(room) - 0.1 * (float(outside) + apart_mm(kept))
         return Path(path.entry, path.target, tuple(kept)), value
 
     def path(self, x: Array) -> Path:
@@ -311,11 +326,11 @@ def places(
     rise = settings.strength_mpa * model.fill - model.material.tension
     alone = mechanisms[0].load_n
     base, worth = [], []
-    field = np.zeros(model.grid.shape)
+    field = np.zeros((*model.grid.shape, 8))
     for each in mechanisms:
         load, more = each.bound(model.material.tension, rise)
         field[tuple(model.mesh.cells.T)] = more / alone
-        density = grid.mean(model.grid.spread(field) * bone.marrow)[where]  # per element's volume
+        density = grid.mean(model.grid.spread_octants(field) * bone.marrow)[where]  # per octant's volume
         base.append(load / alone)
-        worth.append(density * (size_mm / model.mesh.size_mm) ** 3 / room_ml)
+        worth.append(density * 8 * (size_mm / model.mesh.size_mm) ** 3 / room_ml)
     return Worth(grid.centres(index), room_ml, np.array(base), np.array(worth))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from femoreg_torch.planning.element import Template, moduli, template
+from femoreg_torch.planning.element import Template, moduli, stiffness, template
 from femoreg_torch.planning.laws import Material
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ class Response:
     state: State
     share: Array  # (E, 8) yield over trial stress, 1 where elastic
     normal: Array  # (E, 8, 6) direction of the deviatoric stress, tensor components, of norm 1
-    mean_stress: Array  # (E,)
+    mean_stress: Array  # (E, 8)
     mises: Array  # (E, 8)
 
 
@@ -62,19 +62,19 @@ class Plasticity:
         """Stress after a step that ends at displacements (E, 24) in mm, from a state before it."""
         strained = displacement / size_mm
         made, count = self._made, len(strained)
-        pressure = self._bulk * (strained @ made.dilatation)  # the mean stress, above 0 in tension
+        pressure = self._bulk * (strained @ made.dilatation)[:, None]  # the mean stress, above 0 in tension
         deviator = (strained @ made.deviator.reshape(48, 24).T).reshape(count, 8, 6)
         deviator[:, :, 3:] /= 2
-        trial = 2 * self._shear[:, None, None] * (deviator - state.strain)
+        trial = 2 * self._shear[:, :, None] * (deviator - state.strain)
         norm = _norm(trial)
         yields = np.maximum(self._cohesion - self._slope * pressure, _LEAST_YIELD * self._cohesion)
         mises = np.sqrt(1.5) * norm
-        share = np.minimum(1.0, yields[:, None] / np.maximum(mises, 1e-30))
+        share = np.minimum(1.0, yields / np.maximum(mises, 1e-30))
         stress = share[:, :, None] * trial
-        flow = (1 - share[:, :, None]) * trial / (2 * self._shear[:, None, None])
+        flow = (1 - share[:, :, None]) * trial / (2 * self._shear[:, :, None])
         normal = trial / np.maximum(norm, 1e-30)[:, :, None]
         made_force = (stress.reshape(count, 48) @ made.deviator.reshape(48, 24)) / 8
-        force = made_force + pressure[:, None] * made.dilatation
+        force = made_force + pressure.mean(1)[:, None] * made.dilatation
         after = State(state.strain + flow, state.equivalent + np.sqrt(2 / 3) * _norm(flow))
         return Response(force, after, share, normal, pressure, share * mises)
 
@@ -83,15 +83,14 @@ class Plasticity:
 
         Without that part it is symmetric and, for von Mises, exact: 2G θ (I − n ⊗ n) + K 1 ⊗ 1.
         """
-        made, count = self._made, len(self._bulk)
-        scales = 2 * self._shear[:, None] * response.share
-        stiffness = (scales / 2) @ made.shear.reshape(8, 576) + self._bulk[:, None] * made.volumetric.reshape(1, 576)
-        stiffness = stiffness.reshape(count, 24, 24)
+        made = self._made
+        scales = 2 * self._shear * response.share
+        tangent = stiffness(self._bulk, scales / 2)
         yielded = np.flatnonzero((response.share < 1).any(1))
         along = np.einsum("gij,egi->egj", made.deviator, response.normal[yielded])
         weight = np.where(response.share[yielded] < 1, scales[yielded], 0.0) / 8
-        stiffness[yielded] -= (along * weight[:, :, None]).transpose(0, 2, 1) @ along
-        return np.asarray(stiffness)
+        tangent[yielded] -= (along * weight[:, :, None]).transpose(0, 2, 1) @ along
+        return tangent
 
 
 def _norm(tensor: Array) -> Array:

@@ -64,6 +64,6 @@ def prepare(case: Case, planning: Planning, size_mm: float | None = None) -> Pre
     femur = cut_out(ct, bones.labels, number, head, case.side, planning.mesh.shaft_mm)
     bone = make_bone(femur, calibrate(ct.data.numpy(), planning.calibration), planning)
     model = make_model(bone, planning, size_mm)
-    loading = make_loading(model.mesh, femur.frame, planning.load)
-    press = Press(model.mesh, loading, planning.bone.poisson, planning.load.pad_modulus_mpa)
+    loading = make_loading(model, femur, planning.load)
+    press = Press(model.mesh, loading, planning.bone.poisson)
     return Prepared(ct, bone, model, press, planning)

@@ -164,14 +164,14 @@ def _write_fields(file: File, prepared: Prepared, plan: FemoroplastyPlan) -> Non
     order = [0, 4, 6, 2, 1, 5, 7, 3]  # of VTK's hexahedron, from corners counted with z fastest
     mesh, model = prepared.model.mesh, prepared.model
     cells = {
-        "fill": model.fill,
+        "fill": model.fill.mean(1),
         "ash_g_cc": model.ash,
-        "modulus_mpa": model.material.modulus,
-        "strength_mpa": model.material.tension,
-        "cement": model.cement_share(plan.cement),
-        "optimum": model.cement_share(plan.optimum.cement),
-        "plastic_strain_without": plan.optimum.baseline.plastic,
-        "plastic_strain_planned": plan.curve.plastic,
+        "modulus_mpa": model.material.modulus.mean(1),
+        "strength_mpa": model.material.tension.mean(1),
+        "cement": model.cement_share(plan.cement).mean(1),
+        "optimum": model.cement_share(plan.optimum.cement).mean(1),
+        "plastic_strain_without": plan.optimum.baseline.plastic.mean(1),
+        "plastic_strain_planned": plan.curve.plastic.mean(1),
     }
     written = meshio.Mesh(
         mesh.points,

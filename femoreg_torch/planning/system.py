@@ -41,16 +41,12 @@ class Assembler:
         flat = np.bincount(self.freedoms.ravel(), force.ravel(), minlength=3 * len(self.mesh.nodes))
         return np.asarray(flat.reshape(-1, 3))
 
-    def matrix(self, stiffness: Array, springs: Array, scale: Array | None = None) -> sparse.bsr_array:
-        """The matrix (3N, 3N) of element matrices and springs (N, 3, 3).
-
-        Element matrices are (E, 24, 24), or one (24, 24) with `scale` (E,).
-        """
+    def matrix(self, stiffness: Array, springs: Array) -> sparse.bsr_array:
+        """The matrix (3N, 3N) of element matrices (E, 24, 24) and springs (N, 3, 3)."""
         blocks = np.zeros((len(self._column), 9))
         for first in range(0, len(self.mesh.elements), _CHUNK):
             part = slice(first, first + _CHUNK)
-            values = stiffness[part] if scale is None else stiffness[None] * scale[part, None, None]
-            split = values.reshape(-1, 8, 3, 8, 3).transpose(0, 1, 3, 2, 4).reshape(-1, 9)
+            split = stiffness[part].reshape(-1, 8, 3, 8, 3).transpose(0, 1, 3, 2, 4).reshape(-1, 9)
             place = self._place[part].ravel()
             for n in range(9):
                 blocks[:, n] += np.bincount(place, split[:, n], minlength=len(blocks))

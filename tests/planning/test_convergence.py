@@ -21,8 +21,8 @@ from femoreg_torch.volume import Volume
 def prepared_femur(ct: Volume, femur: Femur, planning: Planning, size_mm: float) -> Prepared:
     bone = make_bone(femur, Calibration("uncalibrated", 0.000887, 0.0633, {}), planning)
     model = make_model(bone, planning, size_mm)
-    loading = make_loading(model.mesh, femur.frame, planning.load)
-    press = Press(model.mesh, loading, planning.bone.poisson, planning.load.pad_modulus_mpa)
+    loading = make_loading(model, femur, planning.load)
+    press = Press(model.mesh, loading, planning.bone.poisson)
     return until_yield(Prepared(ct, bone, model, press, planning))
 
 

@@ -18,7 +18,7 @@ def bar(counts: tuple[int, int, int], size: float = 1.0) -> Mesh:
 
 
 def test_rigid_motions_cost_nothing_and_the_stiffness_is_symmetric() -> None:
-    stiffness = elastic_stiffness(POISSON)
+    stiffness = elastic_stiffness(np.ones((1, 8)), POISSON)[0]
     np.testing.assert_allclose(stiffness, stiffness.T, atol=1e-15)
     np.testing.assert_allclose(stiffness @ rigid_modes(CORNERS.astype(float)), 0, atol=1e-15)
     values = np.linalg.eigvalsh(stiffness)
@@ -29,8 +29,8 @@ def test_patch_with_a_linear_field_on_its_boundary_takes_it_on_inside() -> None:
     mesh = bar((3, 3, 3), 2.0)
     field = np.random.default_rng(0).normal(size=(3, 3)) * 1e-3
     wanted = mesh.nodes @ field.T
-    modulus = np.full(27, 700.0)
-    matrix = Assembler(mesh).matrix(elastic_stiffness(POISSON), np.zeros((64, 3, 3)), modulus * 2.0).tocsr()
+    stiffness = elastic_stiffness(np.full((27, 8), 700.0), POISSON)
+    matrix = Assembler(mesh).matrix(2.0 * stiffness, np.zeros((64, 3, 3))).tocsr()
     inside = ((mesh.nodes > 0) & (mesh.nodes < 6)).all(1).repeat(3)
     flat = wanted.ravel()
     found = spsolve(matrix[inside][:, inside].tocsc(), -matrix[inside][:, ~inside] @ flat[~inside])
@@ -64,7 +64,8 @@ def test_the_matrix_is_that_of_scikit_fem() -> None:
         single = skfem.Basis(other, element, intorder=3, elements=np.array([n]))
         volume = skfem.LinearForm(lambda v, w: div(v)).assemble(single)
         matrix += bulk[n] * np.outer(volume, volume)
-    ours = Assembler(mesh).matrix(elastic_stiffness(POISSON), np.zeros((len(mesh.nodes), 3, 3)), modulus).toarray()
+    stiffness = elastic_stiffness(modulus[:, None].repeat(8, 1), POISSON)
+    ours = Assembler(mesh).matrix(stiffness, np.zeros((len(mesh.nodes), 3, 3))).toarray()
     theirs = np.empty(3 * len(mesh.nodes), int)
     order_theirs = np.lexsort(other.p)
     theirs[(3 * order[:, None] + np.arange(3)).ravel()] = basis.nodal_dofs.T[order_theirs].ravel()
@@ -78,7 +79,8 @@ def test_cantilever_bends_as_timoshenko_says() -> None:
     assembler = Assembler(mesh)
     springs = np.zeros((len(mesh.nodes), 3, 3))
     springs[mesh.nodes[:, 0] == 0] = 1e9 * np.eye(3)
-    matrix = assembler.matrix(elastic_stiffness(POISSON), springs, np.full(len(mesh.elements), modulus * size))
+    stiffness = elastic_stiffness(np.full((len(mesh.elements), 8), modulus), POISSON)
+    matrix = assembler.matrix(size * stiffness, springs)
     end = mesh.nodes[:, 0] == 100
     load = np.zeros((len(mesh.nodes), 3))
     share = np.where((mesh.nodes[end, 1:] % 10 == 0), 0.5, 1.0).prod(1)
@@ -91,8 +93,35 @@ def test_cantilever_bends_as_timoshenko_says() -> None:
     np.testing.assert_allclose(matrix @ u.ravel(), load.ravel(), atol=1e-6 * force)
 
 
+@pytest.mark.parametrize(("mean_only", "error"), [(False, 0.06), (True, 0.3)])
+def test_a_half_filled_element_bends_as_thick_as_it_is_filled(mean_only: bool, error: float) -> None:
+    """A beam 5 mm high of elements of 2 mm, the uppermost filled to the half.
+
+    With a modulus at each Gauss point it bends as it should. With the element's mean it is a quarter too stiff: half
+    the modulus in the whole element lies further out.
+    """
+    size, modulus, force, length, width, height = 2.0, 1000.0, 1.0, 80.0, 4.0, 5.0
+    mesh = bar((40, 2, 3), size)
+    filled = np.ones((len(mesh.elements), 8))
+    filled[(mesh.cells[:, 2] == 2)[:, None] & (CORNERS[:, 2] == 1)] = 0.0
+    moduli = modulus * np.maximum(filled.mean(1, keepdims=True) if mean_only else filled, 0.005)
+    moduli = np.broadcast_to(moduli, filled.shape)
+    assembler = Assembler(mesh)
+    springs = np.zeros((len(mesh.nodes), 3, 3))
+    springs[mesh.nodes[:, 0] == 0] = 1e7 * np.eye(3)
+    matrix = assembler.matrix(size * elastic_stiffness(moduli, POISSON), springs)
+    end = (mesh.nodes[:, 0] == length) & (mesh.nodes[:, 2] < 5)
+    load = np.where(end, force / end.sum(), 0.0)[:, None] * [0.0, 0.0, 1.0]
+    u = spsolve(matrix.tocsc(), load.ravel()).reshape(-1, 3)
+    inertia, shear_modulus = width * height**3 / 12, modulus / (2 * (1 + POISSON))
+    expected = force * length**3 / (3 * modulus * inertia) + force * length / (5 / 6 * shear_modulus * width * height)
+    found = expected / u[end, 2].mean() - 1  # how much too stiff
+    assert (found > 0.15) == mean_only
+    assert abs(found) < error
+
+
 def cube(tension: float, compression: float) -> Plasticity:
-    one = np.ones(1)
+    one = np.ones((1, 8))
     return Plasticity(Material(1000 * one, tension * one, compression * one), POISSON)
 
 
@@ -122,8 +151,8 @@ def test_a_cube_yields_at_its_strengths(tension: float, compression: float) -> N
 
 def test_the_tangent_is_the_derivative_of_the_forces() -> None:
     rng = np.random.default_rng(3)
-    ones = np.ones(4)
-    law = Plasticity(Material(1000 * ones, 8 * ones, 8 * ones), POISSON)
+    strength = rng.uniform(6, 10, (4, 8))
+    law = Plasticity(Material(rng.uniform(500, 1500, (4, 8)), strength, strength), POISSON)
     u = rng.normal(size=(4, 24)) * 0.01
     state = law.respond(u * 0.7, 1.0, law.fresh()).state
     response = law.respond(u, 1.0, state)

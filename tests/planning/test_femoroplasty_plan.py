@@ -23,7 +23,17 @@ from femoreg_torch.geometry import Poses
 from femoreg_torch.planning.distribution import mechanism
 from femoreg_torch.planning.model import with_cement
 from femoreg_torch.planning.offsets import carried_out, directions, turned_ends
-from femoreg_torch.planning.path import Ellipsoid, Path, Planner, Surroundings, Worth, central_path, covered, places
+from femoreg_torch.planning.path import (
+    Ellipsoid,
+    Path,
+    Planner,
+    Surroundings,
+    Worth,
+    apart_mm,
+    central_path,
+    covered,
+    places,
+)
 from femoreg_torch.planning.plan import FemoroplastyPlan, make_plan
 from femoreg_torch.planning.prepare import Prepared, prepare
 from femoreg_torch.planning.report import read_plan, write_plan
@@ -99,6 +109,20 @@ def test_the_cement_is_as_much_as_was_asked_and_in_the_marrow(prepared: Prepared
     assert sum(e.volume_ml for e in plan.path.ellipsoids) == pytest.approx(ML)
 
 
+def test_cement_is_one_body(plan: FemoroplastyPlan) -> None:
+    assert apart_mm(plan.path.ellipsoids) == 0
+    assert ndimage.label(plan.cement >= 0.5)[1] == 1
+
+
+def test_balls_of_cement_that_do_not_touch_are_apart() -> None:
+    """1 ml is a ball of 6.204 mm radius, 8 ml one of twice that."""
+    near, far, small = (Ellipsoid(depth, 10.0, 10.0, ml) for depth, ml in ((60.0, 8.0), (35.0, 1.0), (22.0, 1.0)))
+    assert apart_mm([near, far]) == pytest.approx(25 - 3 * 6.2035, abs=1e-3)
+    assert apart_mm([near, far, small]) == pytest.approx(25 - 3 * 6.2035 + 13 - 2 * 6.2035, abs=1e-3)
+    assert apart_mm([far, dataclasses.replace(small, depth_mm=23.0)]) == 0
+    assert apart_mm([near]) == apart_mm([]) == 0
+
+
 def test_the_optimum_beats_cement_anywhere_else(prepared: Prepared, plan: FemoroplastyPlan) -> None:
     bone = prepared.bone
     points = bone.femur.points(np.argwhere(bone.marrow))
@@ -151,7 +175,7 @@ def test_a_mechanism_bounds_what_cement_can_bear(prepared: Prepared, plan: Femor
     ways = [mechanism(curve, material) for curve, material in zip(curves, with_it, strict=True)]
     for own, way in enumerate(ways):
         alone, more = way.bound(model.material.tension, rise)
-        bounds = [alone + float(more @ model.cement_share(share)) for share in placed]
+        bounds = [alone + float((more * model.cement_share(share)).sum()) for share in placed]
         assert bounds[own] == pytest.approx(loads[own], rel=0.02)  # voxels mix before they are averaged
         for bound, load in zip(bounds, loads, strict=True):
             assert bound > 0.8 * load  # yield comes before the limit load, so it is a bound only about
@@ -160,7 +184,7 @@ def test_a_mechanism_bounds_what_cement_can_bear(prepared: Prepared, plan: Femor
     assert worth.base[0] == pytest.approx(1.0)
     everywhere = worth.base[0] + worth.worth[0] @ worth.room_ml  # all of the marrow
     alone, more = ways[0].bound(model.material.tension, rise)
-    filled = alone + float(more @ model.cement_share(bone.marrow.astype(float)))
+    filled = alone + float((more * model.cement_share(bone.marrow.astype(float))).sum())
     assert everywhere == pytest.approx(filled / loads[0], rel=0.05)
 
 

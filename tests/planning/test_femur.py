@@ -10,8 +10,10 @@ from scipy import ndimage
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.calibration import Calibration, calibrate
+from femoreg_torch.planning.element import CORNERS
 from femoreg_torch.planning.femur import Femur, cut_out
 from femoreg_torch.planning.laws import bone_material
+from femoreg_torch.planning.loading import make_loading
 from femoreg_torch.planning.mesh import blocks
 from femoreg_torch.planning.model import make_bone, make_model, with_cement
 from femoreg_torch.planning.settings import CalibrationSettings, Planning, load_planning
@@ -63,21 +65,57 @@ def test_blocks_average_every_voxel_alike(femur: Femur) -> None:
     expected = values.reshape(whole[0] // 3, 3, whole[1] // 3, 3, whole[2] // 3, 3).mean((1, 3, 5))
     np.testing.assert_allclose(grid.mean(values), expected)
     np.testing.assert_allclose(grid.mean(grid.spread(expected)), expected)
+    np.testing.assert_allclose(grid.octants(values).mean(-1), expected)
     odd = blocks(femur, 5.0)
     np.testing.assert_allclose(odd.mean(np.flip(femur.mask, 0)), np.flip(odd.mean(femur.mask), 0))
 
 
-def test_the_mesh_has_the_volume_of_the_label_and_the_surface_its_projection(femur: Femur, planning: Planning) -> None:
+def test_eighths_of_elements_stand_in_the_order_of_corners(femur: Femur) -> None:
+    """Blocks of two voxels' edge: each eighth is one voxel."""
+    even = tuple(n // 2 * 2 for n in femur.mask.shape)
+    cut = dataclasses.replace(femur, mask=femur.mask[: even[0], : even[1], : even[2]])
+    values = np.random.default_rng(1).random(even)
+    grid = blocks(cut, 4.0)
+    found = grid.octants(values)
+    for n, (x, y, z) in enumerate(CORNERS):
+        np.testing.assert_allclose(found[..., n], values[x::2, y::2, z::2])
+    np.testing.assert_allclose(grid.spread_octants(found), values)
+
+
+def test_the_mesh_has_the_volume_of_the_label(femur: Femur, planning: Planning) -> None:
     bone = make_bone(femur, UNCALIBRATED, planning)
     model = make_model(bone, planning, 4.0)
     kept = femur.mask.copy()
     z = np.arange(kept.shape[2]) * 2 + femur.lps_from_index[2, 3]
     kept[:, :, z < 130 - 95] = False
-    assert model.fill.sum() * 4**3 == pytest.approx(kept.sum() * 2**3, rel=0.02)
-    for direction in np.eye(3):
-        width = model.mesh.surface(direction).sum()
-        assert width == pytest.approx(model.mesh.surface(-direction).sum())
-        assert width >= kept.any(int(direction.argmax())).sum() * 4 * 0.99
+    assert model.fill.mean(1).sum() * 4**3 == pytest.approx(kept.sum() * 2**3, rel=0.02)
+    np.testing.assert_array_equal(model.voxels, kept)
+
+
+def test_what_is_shared_out_keeps_its_sum_and_its_middle(femur: Femur, planning: Planning) -> None:
+    mesh = make_model(make_bone(femur, UNCALIBRATED, planning), planning, 6.0).mesh
+    rng = np.random.default_rng(2)
+    points = mesh.centres[rng.integers(0, len(mesh.cells), 200)] + rng.uniform(-3, 3, (200, 3))
+    amounts = rng.random(200)
+    shared = mesh.shared(points, amounts)
+    assert shared.sum() == pytest.approx(amounts.sum())
+    np.testing.assert_allclose(shared @ mesh.points, amounts @ points)
+    beside = mesh.shared(mesh.points.max(0)[None] + 30, np.ones(1))
+    assert beside.sum() == pytest.approx(1)
+    assert beside.max() == pytest.approx(1)  # a corner of the nearest element
+
+
+def test_pads_are_those_of_the_bone_on_every_mesh(femur: Femur, planning: Planning) -> None:
+    """A sphere pressed on by a plane 6 mm beyond its top is met on a circle of π (r² − (r − 6)²)."""
+    bone = make_bone(femur, UNCALIBRATED, planning)
+    loadings = [make_loading(make_model(bone, planning, size), femur, planning.load) for size in (4.0, 5.0, 6.5)]
+    pad = planning.load.pad_modulus_mpa / planning.load.pad_thickness_mm
+    circle = np.pi * (22**2 - (22 - planning.load.pad_depth_mm) ** 2)
+    for loading in loadings:
+        assert loading.head.sum() / pad == pytest.approx(loadings[0].head.sum() / pad)
+        assert loading.trochanter.sum() == pytest.approx(loadings[0].trochanter.sum())
+        assert loading.span_mm == pytest.approx(loadings[0].span_mm)
+    assert loadings[0].head.sum() / pad == pytest.approx(circle, rel=0.15)  # voxels of 2 mm
 
 
 def test_cement_replaces_bone_voxel_by_voxel(femur: Femur, planning: Planning) -> None:
