@@ -227,7 +227,9 @@ def _bones(given: NewCase) -> LabelTable:
         return table
     there = [n for n in torch.unique(read_label_map(given.labels).data).tolist() if n]
     fitting = fitting_tables(there)
-    hint = f"all ids of {' and of '.join(fitting)} are there" if fitting else "no shipped table fits its ids"
+    hint = (
+        f"hip bones and femora of {' and of '.join(fitting)} are there" if fitting else "no shipped table fits its ids"
+    )
     raise InputError(
         f"--bones: is missing, and {given.labels.name} does not name its bones. Say which table its ids are of: "
         f"{', '.join(label_table_names())}, or a YAML file ({hint})."

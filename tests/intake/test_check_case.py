@@ -10,6 +10,7 @@ import cv2
 import nibabel
 import numpy as np
 import pytest
+import torch
 from intake_files import HEAD, case_content, landmarks, markups, ras_affine, write_content, write_files
 
 from femoreg_torch.case import read_case
@@ -235,6 +236,8 @@ def test_warnings_of_a_ct(files: Path) -> None:
     told = ct_warnings(ct)
     assert any("coarse voxels (4 × 4 × 4 mm)" in one for one in told)
     assert not any("air" in one or "cut" in one for one in told)
+    sagittal = type(ct)(ct.data, torch.diag(torch.tensor([2.5, 0.9, 0.9, 1.0]).double()))
+    assert not any("coarse" in one for one in ct_warnings(sagittal))  # slices may be thicker than pixels
     inner = ct.data[:, 15:35, 8:70].contiguous()
     inner[:2] = -100  # fat
     inside = type(ct)(inner, ct.lps_from_index)

@@ -18,6 +18,7 @@ from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.fluoro import Display
 from femoreg_torch.intake import inspect_path
+from femoreg_torch.intake.volumes import fitting_tables
 from femoreg_torch.volume import read_ct, read_labels
 
 
@@ -337,3 +338,8 @@ def test_in_a_terminal_what_is_missing_is_asked_for(
     case = read_case(tmp_path / "case")
     assert len(case.views) == 2
     assert "device" not in case.objects
+
+
+def test_a_table_fits_where_the_hips_do_though_other_bones_lie_outside() -> None:
+    assert fitting_tables([25, 75, 76, 77, 78]) == ["totalsegmentator_v2"]  # no vertebrae, half a sacrum
+    assert fitting_tables([75, 76, 77]) == []
