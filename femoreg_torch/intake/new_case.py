@@ -1,5 +1,6 @@
 """A case folder made of the files that scanner, 3D Slicer, TotalSegmentator and C-arm leave: `femoreg new-case`."""
 
+import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from femoreg_torch.case.reading import VERSIONS
 from femoreg_torch.case.writing import display_content
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import new_folder, plain, write_text
-from femoreg_torch.fluoro import Display, Source, carm_settings, nearest_side, read_header
+from femoreg_torch.fluoro import Display, Source, carm_settings, may_be_image, nearest_side, read_header
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.check import check_case
 from femoreg_torch.intake.volumes import fitting_tables
@@ -164,7 +165,7 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
         notes.append("the path's target is the femoral head, as the plan has no other")
     if given.device is not None:
         content[DEVICE] = _device(folder, given, notes)
-    images, device_images = _files(given.images), _files(given.device_images)
+    images, device_images = _files(given.images, notes), _files(given.device_images, notes)
     content["carm"] = _carm(folder, given, images[0], notes)
     content |= _display(given, images, notes)
     content["views"] = _views(folder, images, device_images, given, notes)
@@ -301,17 +302,26 @@ def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     return content | {"start": vars(place)}
 
 
-def _files(paths: tuple[Path, ...]) -> list[Path]:
-    """The files themselves, and all files of folders, by name."""
+def _files(paths: tuple[Path, ...], notes: list[str]) -> list[Path]:
+    """The files themselves, and the images of folders, by name: numbers in names count as numbers."""
     found: list[Path] = []
     for path in paths:
-        if path.is_dir():
-            found += sorted(entry for entry in path.rglob("*") if entry.is_file() and not entry.name.startswith("."))
-        else:
+        if not path.is_dir():
             found.append(path)
+            continue
+        files = [entry for entry in path.rglob("*") if entry.is_file() and not entry.name.startswith(".")]
+        images = [entry for entry in files if may_be_image(entry)]
+        found += sorted(images, key=_counted)
+        if others := sorted(entry.name for entry in set(files) - set(images)):
+            notes.append(f"{path}: passed over {', '.join(others)[:200]}, which hold no image")
     if paths and not found:
-        raise InputError(f"{paths[0]}: a folder without files. Name images, or a folder of images.")
+        raise InputError(f"{paths[0]}: a folder without images. Name images, or a folder of images.")
     return found
+
+
+def _counted(path: Path) -> list[tuple[int, str]]:
+    """A key by which `IM2` comes before `IM10`."""
+    return [(int(word), "") if word.isdecimal() else (-1, word) for word in re.split(r"(\d+)", str(path))]
 
 
 def _views(

@@ -26,6 +26,10 @@ LEAST_OVERLAP = 0.90  # Dice of the outlined bones
 # open (9° open: 2 to 3° off afterwards).
 MOST_ROTATION_DEG = 5.0
 _MIRRORED = Display(mirrored=True)
+_OF_A_SIDE = (
+    "This view is taken from a side, and the shipped network knows views from the front and from behind: pick the "
+    "landmarks in the image (--landmarks), or put another view first."
+)
 GIVEN_DEVIATION_MM = 1.5  # on the detector, along each axis: of landmarks that a person picked in the image
 
 
@@ -51,7 +55,8 @@ def start_by_detection(case: Case, scene: Scene, detection: Detection) -> StartR
             case.landmarks, detection, image, case.carm.camera, scene.outline, anatomy, field, case.display_of(0).beam
         )
     except InputError as error:
-        raise InputError(f"{case.views[0].images[scene.first_kind]}: {error}") from error
+        seen = f"{case.views[0].images[scene.first_kind]}: {error}"
+        raise InputError(f"{seen} {_OF_A_SIDE}" if case.display_of(0).source in ("left", "right") else seen) from error
     stored = case.display_of(0).pixels_to_stored(detection.pixels, case.carm.camera)
     if (distortion := view_distortion(case, 0)) is not None:
         stored = torch.from_numpy(distortion.bent(stored.numpy()))
