@@ -44,6 +44,12 @@ from femoreg_torch.volume.dicom import is_dicom
 NEEDED = ("ct", "labels", "landmarks", "plan", "images")
 _COPIED = (".nii", ".nii.gz", ".nrrd", ".mha")  # volumes of one file, which are taken as they are
 _OWN_TABLE = "femoreg"  # of label maps that are made here
+_SAID_BY = {  # what a problem asks to write into `case.yaml`, and the options that write it
+    "`display:": "--source, --mirrored, --turned or --ignore-header",
+    "`frames:": "--frames",
+    "`intensity:": "--intensity",
+    "`carm:": "--carm",
+}
 _DEVICE_HU = 5000.0  # of the paper's device
 
 
@@ -96,7 +102,9 @@ def make_case(out: Path, given: NewCase) -> list[str]:
         checked = check_case(folder, find_start=False)
         if checked.problems:
             told = [problem.replace(str(folder), str(out)) for problem in checked.problems]
-            raise InputError(_together(f"{out}: not written", told))
+            flags = [flag for key, flag in _SAID_BY.items() if any(key in problem for problem in told)]
+            hint = f" To new-case, this is said by {', '.join(flags)}." if flags else ""
+            raise InputError(_together(f"{out}: not written", told) + hint)
         notes += checked.warnings
     return notes
 
@@ -371,15 +379,24 @@ def _carm(folder: Path, given: NewCase, image: Path, notes: list[str]) -> str | 
 
 
 def _display(given: NewCase, images: list[Path], notes: list[str]) -> dict[str, Any]:
-    """How pictures are stored: as the flags say, or else the side that the header of the first image puts the source.
+    """How pictures are stored: as the flags say, or else as the header of the first image does.
 
     What other images say is held against it when the case is checked.
     """
     source, tags = given.source, read_header(images[0]) if is_dicom(images[0]) else None
-    if source is None and not given.ignore_header and tags is not None and tags.source_deg is not None:
-        source = nearest_side(tags.source_deg)
+    known = None if given.ignore_header else tags
+    if source is None and known is not None and known.source_deg is not None:
+        source = nearest_side(known.source_deg)
         notes.append(f"the source stands on the patient's {source} side, by the header of {images[0].name}")
     display = Display(source or "anterior", given.mirrored, given.turned, given.ignore_header)
+    told = None if known is None else known.display(display.source)
+    if told is not None and told != display and not given.mirrored and not given.turned:
+        display = told
+        words = [
+            *(["mirrored"] if told.mirrored else []),
+            *([f"turned by {told.turned_deg}°"] if told.turned_deg else []),
+        ]
+        notes.append(f"the pictures are {' and '.join(words)}, by PatientOrientation in the header of {images[0].name}")
     if source is None and tags is None:
         notes.append("the source is taken to stand in front of the patient, as no --source was given")
     return display_content(display)

@@ -230,7 +230,9 @@ def test_headers_say_side_and_values_and_flags_may_say_otherwise(
     found = inspect_path(tmp_path / "images" / "run1")
     assert any("the patient's posterior side" in fact for fact in found.facts)
     assert any("shown: the first frame" in fact for fact in found.facts)
-    assert "holds 2 frames, one was expected" in made("cine")
+    told = made("cine")
+    assert "holds 2 frames, one was expected" in told
+    assert "To new-case, this is said by --frames." in told
     assert "the patient's posterior side, by the header of run1" in made("behind", frames="mean")
     case = read_case(tmp_path / "behind")
     assert (case.display, case.views[0].frames, case.views[0].intensity) == (Display("posterior"), "mean", None)
@@ -244,6 +246,13 @@ def test_headers_say_side_and_values_and_flags_may_say_otherwise(
     assert content["display"] == {"source": "anterior", "mirrored": False, "turned": 90, "ignore_header": True}
     assert [view["frames"] for view in content["views"]] == [1, 1]
     assert "holds intensities (raw) by its PixelInt" in made("logs", frames=1, intensity="log")
+    for n in (1, 2):
+        write_dicom_image(tmp_path / f"images/run{n}", n, PatientOrientation=["H", "R"])  # L, F, mirrored, turned
+    assert "the pictures are mirrored and turned by 90°, by PatientOrientation" in made("turned")
+    assert read_case(tmp_path / "turned").display == Display("anterior", mirrored=True, turned_deg=90)
+    told = made("otherwise", turned=180)
+    assert "does not fit the display" in told
+    assert "said by --source, --mirrored, --turned or --ignore-header." in told
     for n in (1, 2):
         write_dicom_image(tmp_path / f"images/run{n}", n, Modality="DX")
     assert any("does not say what its values are" in one for one in inspect_path(tmp_path / "images/run1").warnings)
