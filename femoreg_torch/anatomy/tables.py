@@ -1,5 +1,6 @@
 """Label tables: which ids of a label map belong to which bone."""
 
+import re
 from pathlib import Path
 
 from femoreg_torch.anatomy.body import Anatomy
@@ -8,6 +9,7 @@ from femoreg_torch.errors import InputError, shortened
 
 _GROUP = "anatomy/labels"
 LARGEST_ID = 65535
+_SIDES = {"l": "left", "lt": "left", "r": "right", "rt": "right"}  # as people shorten them
 
 LabelTable = dict[str, tuple[int, ...]]  # ids of bones (or of groups of bones) by name
 
@@ -40,9 +42,18 @@ def label_ids(value: object, where: str) -> tuple[int, ...]:
 
 
 def bone_of_name(anatomy: Anatomy, text: str) -> str | None:
-    """The bone, or group of bones, that another program calls by this name (a segment, a file), or None."""
-    wanted = " ".join(text.replace("_", " ").replace("-", " ").lower().split())
+    """The bone, or group of bones, that another program calls by this name (a segment, a file), or None.
+
+    Neither the order of the words nor what stands between them counts: "Femur (Right)", "femur_R" and "rt. femur" are
+    one bone.
+    """
+    wanted = _words(text)
     for bone in anatomy.bones:
-        if wanted in (bone.name.replace("_", " "), *bone.names):
+        if wanted in [_words(name) for name in (bone.name, *bone.names)]:
             return bone.name
-    return next((group for group in anatomy.groups if wanted == group.replace("_", " ")), None)
+    return next((group for group in anatomy.groups if wanted == _words(group)), None)
+
+
+def _words(text: str) -> list[str]:
+    """The words of a name in order of the alphabet, sides written out."""
+    return sorted(_SIDES.get(word, word) for word in re.findall(r"[^\W_]+", text.lower()))

@@ -146,13 +146,15 @@ def new_case(
         device_transform: In place of these: a transform of 3D Slicer under which the device stands right in the CT.
         images: Images without the device, one for each C-arm pose, in order; or a folder of them.
         device_images: Images with the device, in the same order; or a folder of them.
-        carm: C-arm: a preset (cios_fusion) or a YAML file; by default what the tags of the first DICOM image say.
+        carm: C-arm: a preset (cios_fusion, cios_spin) or a YAML file; by default what the tags of the first DICOM image
+            say.
         intensity: raw (bone dark) or log (attenuation, bone bright); by default what the files say, or else raw.
         frames: Of cine runs, a frame's number from 1, or `mean` of all.
         source: Side of the patient that the X-ray source stands on; by default what the header of the first image says,
             or else anterior.
-        mirrored: The pictures are mirror images of the usual ones, which have the patient's left on their right.
-        turned: Degrees by which the pictures are turned clockwise against head up.
+        mirrored: The pictures are mirror images of the usual ones, which have the patient's left on their right. By
+            default what PatientOrientation in the header of the first image says.
+        turned: Degrees by which the pictures are turned clockwise against head up; by default as `mirrored`.
         ignore_header: What DICOM headers say of the side of the source and of the pictures' orientation means nothing.
         segment: Find the bones in the CT if --labels is not given, and propose landmarks if --landmarks is not; see
             `femoreg segment` and `femoreg landmarks`.

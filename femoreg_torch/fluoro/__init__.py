@@ -9,6 +9,7 @@ from femoreg_torch.fluoro.intensity import attenuation_image, binned, downsample
 from femoreg_torch.fluoro.reading import (
     StoredImage,
     check_matches,
+    may_be_image,
     read_image,
     read_stored,
     settled_intensity,
@@ -40,6 +41,7 @@ __all__ = [
     "find_distortion",
     "find_grid_spots",
     "find_shutter",
+    "may_be_image",
     "nearest_side",
     "read_header",
     "read_image",

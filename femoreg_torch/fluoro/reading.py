@@ -13,10 +13,11 @@ from torch import Tensor
 from femoreg_torch.arrays import MOST_PIXELS, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
-from femoreg_torch.fluoro.dicom import DicomImage, Frames, read_dicom
+from femoreg_torch.fluoro.dicom import DicomImage, Frames, read_dicom, read_header
 from femoreg_torch.fluoro.tags import Tags
 from femoreg_torch.geometry import Camera
 from femoreg_torch.text import read_bytes
+from femoreg_torch.volume.dicom import is_dicom
 from femoreg_torch.volume.itk import read_itk
 
 _ITK_SUFFIXES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
@@ -109,6 +110,16 @@ def read_stored(path: Path, frames: Frames | None = None) -> StoredImage:
         return StoredImage(image, remarks=remarks, asks="looks like logarithms already" if looks_log else None)
     padding = None if dicom.padding is None else torch.from_numpy(dicom.padding)
     return StoredImage(image, dicom.intensity, dicom.tags, padding, remarks, dicom.asks)
+
+
+def may_be_image(path: Path) -> bool:
+    """Whether a file of a folder is meant as an image: by its suffix, or as a DICOM file that holds pixels.
+
+    Exports hold others beside them: DICOMDIR, reports, presentation states, a viewer.
+    """
+    if path.name.lower().endswith(_PICTURE_SUFFIXES + _SCREEN_SUFFIXES + _ITK_SUFFIXES):
+        return True
+    return is_dicom(path) and read_header(path).shape is not None
 
 
 def read_image(path: Path, frames: Frames | None = None) -> Tensor:

@@ -36,7 +36,7 @@ from femoreg_torch.intake.check_anatomy import (
 )
 from femoreg_torch.intake.check_images import check_images, check_views, readable_views
 from femoreg_torch.intake.found import Found
-from femoreg_torch.intake.planes import Picture
+from femoreg_torch.intake.planes import Picture, side_by_side, stacked
 from femoreg_torch.intake.start_picture import picture_of_start
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.registration.models import model_attenuation
@@ -46,6 +46,7 @@ from femoreg_torch.volume.borders import cut_bones
 _ANY_PATH = PlannedPath(FEMUR, torch.zeros(3).double(), torch.ones(3).double())
 _ANY_POINTS = {name: n * torch.ones(3).double() for n, name in enumerate(DEVICE_POINTS)}
 _FAR_MM = 150.0  # from the middle of a device, beyond its own size, no point of it lies
+_GUIDE_MM = (20.0, 600.0)  # from base to tip; a model in metres, inches or µm is likely beyond
 _FAR_FROM_BONE_MM = 400.0  # a device that starts farther from the entry point is likely told wrong
 
 
@@ -62,31 +63,32 @@ class Checked:
 def check_case(folder: Path, find_start: bool = True, landmarks: Mapping[str, Tensor] | None = None) -> Checked:
     """All problems of the case in `folder`, in words, each with file and key.
 
-    Where nothing is wrong, and `find_start`, its start pose is looked for, by `landmarks` (2,) in pixels of the first
-    image or by the network, and drawn.
+    What could be read of CT, bones, landmarks and images is drawn. Where nothing is wrong, and `find_start`, the start
+    pose is looked for, by `landmarks` (2,) in pixels of the first image or by the network, and drawn over that image.
     """
     folder, found = Path(folder), Found()
     top = found.attempt(lambda: read_fields(folder))
     if top is None:
         return Checked(tuple(found.problems), (), ())
     short = top.content.get("template") == TEMPLATE and top.content.get("version") == 2
-    seen = _check_femoroplasty(top, folder, found) if short else SeenAnatomy()
+    seen, images = _check_femoroplasty(top, folder, found) if short else (SeenAnatomy(), {})
     case = None
     if not found.problems:
         case = found.attempt(lambda: read_case(folder))
     if case is not None and not short:
-        seen = _check_written_out(case, found)
-    picture = planes_of(seen, case)
+        seen, images = _check_written_out(case, found)
+    below = side_by_side(images)
     if case is not None and case.views and find_start and not found.problems:
         start = found.attempt(lambda: picture_of_start(case, landmarks))
         if start is not None:
             found.facts += start.facts
-            picture = start.picture if picture is None else start.below(picture)
+            below = start.picture
+    picture = stacked(planes_of(seen, case), below)
     return Checked(tuple(found.problems), tuple(found.warnings), tuple(found.facts), picture)
 
 
-def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> SeenAnatomy:
-    """Every part of the short form by itself, so that a fault in one hides none in another."""
+def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAnatomy, dict[str, Tensor]]:
+    """Every part of the short form by itself, so that a fault in one hides none in another; also the images, by key."""
     found.unknown_keys(top, ("template", *femoroplasty_form.KEYS))
     side = cast("Side | None", found.attempt(lambda: top.choice("side", femoroplasty_form.SIDES)))
     marks = found.attempt(lambda: read_landmarks(top.file_path("landmarks", folder))) or {}
@@ -117,10 +119,10 @@ def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> SeenAnatomy:
             check_path(path, side, seen, found)
     if DEVICE in top:
         _check_device(top, folder, path, side, found)
-    check_views(top, folder, carm, display, found)
+    images = check_views(top, folder, carm, display, found)
     if "truth" in top:
         found.attempt(lambda: top.file_path("truth", folder))
-    return seen
+    return seen, images
 
 
 def _path(top: Fields, folder: Path, marks: dict[str, Tensor], side: Side) -> PlannedPath:
@@ -145,6 +147,12 @@ def _check_device(top: Fields, folder: Path, path: PlannedPath | None, side: Sid
                     f"{device.where('points')}.{name}: lies {away:.0f} mm from the middle "
                     "of the device. Points are mm in the space of its model; check units and RAS/LPS."
                 )
+    if {"tip", "base"} <= set(points):
+        length = float((points["tip"] - points["base"]).norm())
+        if not _GUIDE_MM[0] <= length <= _GUIDE_MM[1]:
+            found.warnings.append(
+                f"device: its tip lies {length:.3g} mm from its base. Is the model in mm? (Inches are 25.4 of them.)"
+            )
     known = path is not None and side is not None and set(points) == set(DEVICE_POINTS)
     # what a pose in words depends on may be at fault itself: with anything in its place the words are still looked at
     on, along, of = (path, side, points) if known else (_ANY_PATH, "left", _ANY_POINTS)
@@ -171,17 +179,17 @@ def _device_points(device: Fields, folder: Path, found: Found) -> dict[str, Tens
     return found.attempt(lambda: femoroplasty_form.read_device_points(device, folder)) or {}
 
 
-def _check_written_out(case: Case, found: Found) -> SeenAnatomy:
-    """What can be seen of a case that could be read, of any form."""
-    check_images(case, found)
+def _check_written_out(case: Case, found: Found) -> tuple[SeenAnatomy, dict[str, Tensor]]:
+    """What can be seen of a case that could be read, of any form; also its images, by key."""
+    images = check_images(case, found)
     for thing in case.objects.values():
         if thing.model is not None:
             found.attempt(lambda thing=thing: model_attenuation(thing.model))  # type: ignore[misc]
     if case.ct_path is None or case.labels_path is None:
-        return SeenAnatomy(landmarks=case.landmarks, anatomy=case.anatomy)
+        return SeenAnatomy(landmarks=case.landmarks, anatomy=case.anatomy), images
     read = found.attempt(lambda: read_ct_told(cast(Path, case.ct_path)))
     if read is None:
-        return SeenAnatomy(landmarks=case.landmarks, anatomy=case.anatomy)
+        return SeenAnatomy(landmarks=case.landmarks, anatomy=case.anatomy), images
     ct, told = read
     found.warnings += [*told, *header_warnings(case.ct_path), *ct_warnings(ct)]
     found.facts.append(f"CT: {described(ct)}")
@@ -193,4 +201,4 @@ def _check_written_out(case: Case, found: Found) -> SeenAnatomy:
                 found.attempt(lambda thing=thing: bones.of(thing.bones, case.anatomy))  # type: ignore[misc]
     seen = SeenAnatomy(ct, bones, case.landmarks, case.anatomy)
     check_landmarks(seen, found)
-    return seen
+    return seen, images

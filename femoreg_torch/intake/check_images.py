@@ -42,11 +42,16 @@ def readable_views(top: Fields, folder: Path) -> list[View]:
     return read
 
 
-def check_views(top: Fields, folder: Path, carm: CArm | None, display: Display | None, found: Found) -> None:
-    """Every view of the short form by itself. Without a C-arm or display its images are looked at by themselves."""
+def check_views(
+    top: Fields, folder: Path, carm: CArm | None, display: Display | None, found: Found
+) -> dict[str, Tensor]:
+    """Every view of the short form by itself. Without a C-arm or display its images are looked at by themselves.
+
+    Returns the images (H, W) that could be read, by key.
+    """
     views = found.attempt(lambda: top.mappings("views"))
     if views is None:
-        return
+        return {}
     if not views:
         found.problem(f"{top.where('views')}: empty. At least one fluoroscopic image is needed.")
     read: dict[str, Tensor] = {}
@@ -68,16 +73,22 @@ def check_views(top: Fields, folder: Path, carm: CArm | None, display: Display |
     _check_different(read, found)
     if DEVICE in top and views and not any(DEVICE_IMAGES in view for view in views):
         found.warnings.append("no view has an image with the device, so it will not be found")
+    return _by_key(read)
 
 
-def check_images(case: Case, found: Found) -> None:
-    """All images of a case that could be read."""
+def check_images(case: Case, found: Found) -> dict[str, Tensor]:
+    """All images of a case that could be read. Returns those (H, W) that could be read themselves, by key."""
     read: dict[str, Tensor] = {}
     for number, view in enumerate(case.views):
         shown = View({}, view.intensity, frames=view.frames, display=case.display_of(number))
         for kind, path in view.images.items():
             _check_image(path, shown, case.carm, f"{case.folder}/case.yaml, views[{number}].{kind}", read, found)
     _check_different(read, found)
+    return _by_key(read)
+
+
+def _by_key(read: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {where.rpartition(", ")[2]: image for where, image in read.items()}
 
 
 def _check_image(path: Path, view: View, carm: CArm | None, where: str, read: dict[str, Tensor], found: Found) -> None:

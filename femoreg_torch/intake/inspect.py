@@ -169,7 +169,7 @@ def _labels(volume: Volume, names: Mapping[str, tuple[int, ...]], path: Path, wa
             warnings.append(f"no part is named after a bone; known names are, say, {', '.join(HIP.bone_names)}")
     else:
         fitting = fitting_tables(ids)
-        facts.append(f"shipped tables whose ids are all there: {', '.join(fitting) or 'none'}")
+        facts.append(f"shipped tables whose hip bones and femora are there: {', '.join(fitting) or 'none'}")
     whole = Volume(data, volume.lps_from_index)
     warnings += cut_bones(whole, table, list(table))
     tints = {n: HIP.bone(b).colour for b, n in table.items() if b in HIP.bone_names}

@@ -1,5 +1,6 @@
 """A case folder made of the files that scanner, 3D Slicer, TotalSegmentator and C-arm leave: `femoreg new-case`."""
 
+import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from femoreg_torch.case.reading import VERSIONS
 from femoreg_torch.case.writing import display_content
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import new_folder, plain, write_text
-from femoreg_torch.fluoro import Display, Source, carm_settings, nearest_side, read_header
+from femoreg_torch.fluoro import Display, Source, carm_settings, may_be_image, nearest_side, read_header
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.check import check_case
 from femoreg_torch.intake.volumes import fitting_tables
@@ -43,6 +44,12 @@ from femoreg_torch.volume.dicom import is_dicom
 NEEDED = ("ct", "labels", "landmarks", "plan", "images")
 _COPIED = (".nii", ".nii.gz", ".nrrd", ".mha")  # volumes of one file, which are taken as they are
 _OWN_TABLE = "femoreg"  # of label maps that are made here
+_SAID_BY = {  # what a problem asks to write into `case.yaml`, and the options that write it
+    "`display:": "--source, --mirrored, --turned or --ignore-header",
+    "`frames:": "--frames",
+    "`intensity:": "--intensity",
+    "`carm:": "--carm",
+}
 _DEVICE_HU = 5000.0  # of the paper's device
 
 
@@ -95,7 +102,9 @@ def make_case(out: Path, given: NewCase) -> list[str]:
         checked = check_case(folder, find_start=False)
         if checked.problems:
             told = [problem.replace(str(folder), str(out)) for problem in checked.problems]
-            raise InputError(_together(f"{out}: not written", told))
+            flags = [flag for key, flag in _SAID_BY.items() if any(key in problem for problem in told)]
+            hint = f" To new-case, this is said by {', '.join(flags)}." if flags else ""
+            raise InputError(_together(f"{out}: not written", told) + hint)
         notes += checked.warnings
     return notes
 
@@ -164,7 +173,7 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
         notes.append("the path's target is the femoral head, as the plan has no other")
     if given.device is not None:
         content[DEVICE] = _device(folder, given, notes)
-    images, device_images = _files(given.images), _files(given.device_images)
+    images, device_images = _files(given.images, notes), _files(given.device_images, notes)
     content["carm"] = _carm(folder, given, images[0], notes)
     content |= _display(given, images, notes)
     content["views"] = _views(folder, images, device_images, given, notes)
@@ -227,7 +236,9 @@ def _bones(given: NewCase) -> LabelTable:
         return table
     there = [n for n in torch.unique(read_label_map(given.labels).data).tolist() if n]
     fitting = fitting_tables(there)
-    hint = f"all ids of {' and of '.join(fitting)} are there" if fitting else "no shipped table fits its ids"
+    hint = (
+        f"hip bones and femora of {' and of '.join(fitting)} are there" if fitting else "no shipped table fits its ids"
+    )
     raise InputError(
         f"--bones: is missing, and {given.labels.name} does not name its bones. Say which table its ids are of: "
         f"{', '.join(label_table_names())}, or a YAML file ({hint})."
@@ -299,17 +310,26 @@ def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     return content | {"start": vars(place)}
 
 
-def _files(paths: tuple[Path, ...]) -> list[Path]:
-    """The files themselves, and all files of folders, by name."""
+def _files(paths: tuple[Path, ...], notes: list[str]) -> list[Path]:
+    """The files themselves, and the images of folders, by name: numbers in names count as numbers."""
     found: list[Path] = []
     for path in paths:
-        if path.is_dir():
-            found += sorted(entry for entry in path.rglob("*") if entry.is_file() and not entry.name.startswith("."))
-        else:
+        if not path.is_dir():
             found.append(path)
+            continue
+        files = [entry for entry in path.rglob("*") if entry.is_file() and not entry.name.startswith(".")]
+        images = [entry for entry in files if may_be_image(entry)]
+        found += sorted(images, key=_counted)
+        if others := sorted(entry.name for entry in set(files) - set(images)):
+            notes.append(f"{path}: passed over {', '.join(others)[:200]}, which hold no image")
     if paths and not found:
-        raise InputError(f"{paths[0]}: a folder without files. Name images, or a folder of images.")
+        raise InputError(f"{paths[0]}: a folder without images. Name images, or a folder of images.")
     return found
+
+
+def _counted(path: Path) -> list[tuple[int, str]]:
+    """A key by which `IM2` comes before `IM10`."""
+    return [(int(word), "") if word.isdecimal() else (-1, word) for word in re.split(r"(\d+)", str(path))]
 
 
 def _views(
@@ -359,15 +379,24 @@ def _carm(folder: Path, given: NewCase, image: Path, notes: list[str]) -> str | 
 
 
 def _display(given: NewCase, images: list[Path], notes: list[str]) -> dict[str, Any]:
-    """How pictures are stored: as the flags say, or else the side that the header of the first image puts the source.
+    """How pictures are stored: as the flags say, or else as the header of the first image does.
 
     What other images say is held against it when the case is checked.
     """
     source, tags = given.source, read_header(images[0]) if is_dicom(images[0]) else None
-    if source is None and not given.ignore_header and tags is not None and tags.source_deg is not None:
-        source = nearest_side(tags.source_deg)
+    known = None if given.ignore_header else tags
+    if source is None and known is not None and known.source_deg is not None:
+        source = nearest_side(known.source_deg)
         notes.append(f"the source stands on the patient's {source} side, by the header of {images[0].name}")
     display = Display(source or "anterior", given.mirrored, given.turned, given.ignore_header)
+    told = None if known is None else known.display(display.source)
+    if told is not None and told != display and not given.mirrored and not given.turned:
+        display = told
+        words = [
+            *(["mirrored"] if told.mirrored else []),
+            *([f"turned by {told.turned_deg}°"] if told.turned_deg else []),
+        ]
+        notes.append(f"the pictures are {' and '.join(words)}, by PatientOrientation in the header of {images[0].name}")
     if source is None and tags is None:
         notes.append("the source is taken to stand in front of the patient, as no --source was given")
     return display_content(display)

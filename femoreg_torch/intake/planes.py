@@ -1,4 +1,7 @@
-"""Three planes of a CT or a label map as one picture, as radiologists look at them: the patient's left on the right."""
+"""Three planes of a CT or a label map as one picture, as radiologists look at them: the patient's left on the right.
+
+And X-ray images side by side, as they are stored.
+"""
 
 from collections.abc import Mapping
 
@@ -14,6 +17,8 @@ from femoreg_torch.volume import Volume, resample_isotropic
 Picture = NDArray[np.uint8]  # (H, W, 3), blue, green, red
 _WINDOW_HU = (-250.0, 1000.0)
 _HEIGHT_PX = 420
+_CELL_PX, _COLUMNS = 300, 3  # of images side by side
+_ENDS_PERCENT = (0.5, 99.5)  # of the pixels, that set the window of an image
 _TINT = 0.35
 _WHITE, _YELLOW = (255, 255, 255), (60, 230, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -58,6 +63,40 @@ def three_planes(
         panels.append(_captioned(panel, name, left, right))
     height = max(panel.shape[0] for panel in panels)
     return np.hstack([cv2.copyMakeBorder(p, 0, height - p.shape[0], 0, 6, cv2.BORDER_CONSTANT) for p in panels])
+
+
+def side_by_side(images: Mapping[str, Tensor]) -> Picture | None:
+    """Images (H, W) by name as they are stored, three in a row; None if there are none."""
+    if not images:
+        return None
+    cells = [_cell(name, image) for name, image in images.items()]
+    blank = np.zeros_like(cells[0])
+    cells += [blank] * (-len(cells) % min(_COLUMNS, len(cells)))
+    columns = min(_COLUMNS, len(cells))
+    return np.vstack([np.hstack(cells[n : n + columns]) for n in range(0, len(cells), columns)])
+
+
+def stacked(above: Picture | None, below: Picture | None) -> Picture | None:
+    """Both pictures, one below the other, or the one that is there."""
+    if above is None or below is None:
+        return below if above is None else above
+    width = max(above.shape[1], below.shape[1])
+    wide = [cv2.copyMakeBorder(p, 0, 6, 0, width - p.shape[1], cv2.BORDER_CONSTANT) for p in (above, below)]
+    return np.vstack(wide)
+
+
+def _cell(name: str, image: Tensor) -> Picture:
+    """One image in a square, with its name."""
+    values = image.numpy()
+    low, high = np.percentile(values, _ENDS_PERCENT)
+    grey = ((values - low) / max(high - low, 1e-9) * 255).clip(0, 255).astype(np.uint8)
+    shrink = (_CELL_PX - 6) / max(grey.shape)
+    small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    cell = np.zeros((_CELL_PX, _CELL_PX, 3), np.uint8)
+    cell[: small.shape[0], : small.shape[1]] = small[..., None]
+    for colour, width in (((0, 0, 0), 4), (_YELLOW, 1)):  # seen on any background
+        cv2.putText(cell, name, (6, 18), _FONT, 0.45, colour, width, cv2.LINE_AA)
+    return cell
 
 
 def _middle(labels: Volume | None, volume: Volume) -> Tensor:

@@ -31,12 +31,6 @@ class StartPicture:
     picture: Picture
     facts: tuple[str, ...]
 
-    def below(self, above: Picture) -> Picture:
-        """Both pictures, one below the other."""
-        width = max(above.shape[1], self.picture.shape[1])
-        wide = [cv2.copyMakeBorder(p, 0, 6, 0, width - p.shape[1], cv2.BORDER_CONSTANT) for p in (above, self.picture)]
-        return np.vstack(wide)
-
 
 def picture_of_start(case: Case, landmarks: Mapping[str, Tensor] | None = None) -> StartPicture:
     """The start poses of a case, drawn. Raises `InputError` if there is no start, as the registration would."""

@@ -14,6 +14,7 @@ from femoreg_torch.volume import Volume
 from femoreg_torch.volume.borders import touched_faces
 
 _COARSE_MM, _COARSE_STEP_MM = 1.5, 3.0  # the registration takes voxels of 1 mm
+_OF_THE_HIPS = ("hip_left", "hip_right", "femur_left", "femur_right")
 _SOFT_HU, _BONE_HU, _METAL_HU = -50.0, 300.0, 2800.0
 _LEAST_AIR = 0.005  # share of the voxels; beside every patient there is some
 _METAL_ML = 1.0
@@ -36,7 +37,8 @@ def ct_warnings(ct: Volume) -> list[str]:
     """In words, what may spoil a registration with this CT, HU."""
     told = []
     x, y, z = ct.spacing_mm
-    if max(x, y) > _COARSE_MM or z > _COARSE_STEP_MM:
+    _, within, between = sorted(ct.spacing_mm)  # slices may lie along any axis
+    if within > _COARSE_MM or between > _COARSE_STEP_MM:
         told.append(f"coarse voxels ({x:.3g} × {y:.3g} × {z:.3g} mm): outlines of bones get blurred; 1 mm is meant")
     low, high = (float(v) for v in ct.data.aminmax())
     if low > _SOFT_HU or high < _BONE_HU:
@@ -66,10 +68,15 @@ def looks_like_labels(volume: Volume) -> bool:
 
 
 def fitting_tables(ids: Sequence[int]) -> list[str]:
-    """Names of the shipped label tables all of whose ids a map holds."""
+    """Names of the shipped label tables of which a map holds both hip bones and both femora.
+
+    Other bones may lie outside of a CT of the hips.
+    """
     there = set(ids)
     return [
-        name for name in label_table_names() if {n for of_bone in label_table(name).values() for n in of_bone} <= there
+        name
+        for name in label_table_names()
+        if {n for bone, of_bone in label_table(name).items() if bone in _OF_THE_HIPS for n in of_bone} <= there
     ]
 
 

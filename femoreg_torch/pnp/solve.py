@@ -31,6 +31,7 @@ _SUBSET_SIZES = (4, 5, 6)
 _DEPTHS = (0.2, 1.0)  # of the source-to-detector distance: the object lies between source and detector
 _MIDDLE_DEPTHS = (0.45, 0.95)  # the same for the points' centroid: no patient lies on the tube or on the detector
 _HUBER_DEVIATIONS = 1.5
+_MOST_MISFIT = 8.0  # of one point, an outlier: that of 4 standard deviations
 _ROTATION_DEG = 10.0  # greatest standard deviation, over all axes, of a pose that is given
 _STEPS = (0.01, 0.01, 0.01, 1, 1, 10)  # typical sizes of a twist, rad and mm
 _ADVICE = "Take a view that shows more of the object, or give landmarks placed by hand."
@@ -46,6 +47,7 @@ class PnpResult:
     inliers: Tensor  # (N,) bool: within 10 mm on the detector
     rms_px: float  # root mean square reprojection residual of the inliers
     covariance: Tensor  # (6, 6) of (rotation in rad, translation in mm), camera axes, about the used points' centroid
+    misfit: float = float("nan")  # negative log likelihood of all points, each at most 8; only if deviations are known
 
     @property
     def rotation_deviation_deg(self) -> float:
@@ -99,8 +101,13 @@ def solve_pnp(
             f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree on a pose, but at least {MINIMUM} "
             f"and half of them must. {_ADVICE}"
         )
-    distances = _distances(pose, points, pixels, camera)[inliers]
-    result = PnpResult(pose, torch.from_numpy(inliers), float(np.sqrt((distances**2).mean())), covariance)
+    distances = _distances(pose, points, pixels, camera)
+    misfit = float("nan")
+    if deviations_px is not None:
+        spread = _spread_px(pose.numpy(), object_points, deviations_px, point_deviations_mm, camera)
+        misfit = float(np.minimum((distances / spread) ** 2 / 2, _MOST_MISFIT).sum())
+    rms_px = float(np.sqrt((distances[inliers] ** 2).mean()))
+    result = PnpResult(pose, torch.from_numpy(inliers), rms_px, covariance, misfit)
     if deviations_px is not None and result.rotation_deviation_deg > _ROTATION_DEG:
         raise InputError(
             f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree, but they fix the rotation only to "

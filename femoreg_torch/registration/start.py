@@ -1,6 +1,6 @@
 """The start pose: landmarks in view 1, PnP (paper, section II-A), and then the outlines of the bones."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,6 +26,11 @@ LEAST_OVERLAP = 0.90  # Dice of the outlined bones
 # open (9° open: 2 to 3° off afterwards).
 MOST_ROTATION_DEG = 5.0
 _MIRRORED = Display(mirrored=True)
+_SURE_OF_SIDES = 3.0  # log likelihood by which landmarks are to fit better than those of the other side
+_OF_A_SIDE = (
+    "This view is taken from a side, and the shipped network knows views from the front and from behind: pick the "
+    "landmarks in the image (--landmarks), or put another view first."
+)
 GIVEN_DEVIATION_MM = 1.5  # on the detector, along each axis: of landmarks that a person picked in the image
 
 
@@ -51,7 +56,8 @@ def start_by_detection(case: Case, scene: Scene, detection: Detection) -> StartR
             case.landmarks, detection, image, case.carm.camera, scene.outline, anatomy, field, case.display_of(0).beam
         )
     except InputError as error:
-        raise InputError(f"{case.views[0].images[scene.first_kind]}: {error}") from error
+        seen = f"{case.views[0].images[scene.first_kind]}: {error}"
+        raise InputError(f"{seen} {_OF_A_SIDE}" if case.display_of(0).source in ("left", "right") else seen) from error
     stored = case.display_of(0).pixels_to_stored(detection.pixels, case.carm.camera)
     if (distortion := view_distortion(case, 0)) is not None:
         stored = torch.from_numpy(distortion.bent(stored.numpy()))
@@ -63,8 +69,8 @@ def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) ->
 
     Pixels are those of the image as it is stored.
 
-    Raises `InputError` if fewer than four have a name that the case knows, fewer than four agree, or they leave the
-    rotation open by more than 5°.
+    Raises `InputError` if fewer than four have a name that the case knows, fewer than four agree, they leave the
+    rotation open by more than 5°, or, in a view from a side, they may be those of the other side.
     """
     names = [name for name in pixels if name in case.landmarks]
     if len(names) < MINIMUM:
@@ -75,20 +81,23 @@ def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) ->
     camera, display = case.carm.camera, case.display_of(0)
     picked, distortion = torch.stack([pixels[name] for name in names]).double(), view_distortion(case, 0)
     seen = display.pixels_to_camera(picked if distortion is None else distortion.straight(picked), camera)
-    spread = (
-        {}
-        if case.anatomy is None
-        else dict(zip(case.anatomy.landmark_names, case.anatomy.landmark_spread_mm, strict=True))
-    )
-    pnp = solve_pnp(
-        torch.stack([case.landmarks[name] for name in names]).double(),
-        seen,
-        camera,
-        deviations_px=torch.full((len(names),), GIVEN_DEVIATION_MM / camera.mean_pixel_mm, dtype=torch.float64),
-        point_deviations_mm=torch.tensor([spread.get(name, 0.0) for name in names], dtype=torch.float64),
-        beam=display.beam,
-    )
+    spread = {mark.name: mark.spread_mm for mark in case.anatomy.landmarks} if case.anatomy is not None else {}
+
+    def fitted(called: Sequence[str], at: Tensor) -> PnpResult:
+        """The pose by places (N, 2) in the image, if they are the landmarks of these names."""
+        return solve_pnp(
+            torch.stack([case.landmarks[name] for name in called]).double(),
+            at,
+            camera,
+            deviations_px=torch.full((len(called),), GIVEN_DEVIATION_MM / camera.mean_pixel_mm, dtype=torch.float64),
+            point_deviations_mm=torch.tensor([spread.get(name, 0.0) for name in called], dtype=torch.float64),
+            beam=display.beam,
+        )
+
+    pnp = fitted(names, seen)
     _check_rotation(pnp)
+    if display.source in ("left", "right") and case.anatomy is not None:
+        _check_sides(case.anatomy, case.landmarks, names, seen, fitted)
     marks = {
         name: LandmarkRecord(_pair(pixels[name]), 1.0, True, inlier)
         for name, inlier in zip(names, pnp.inliers.tolist(), strict=True)
@@ -157,6 +166,34 @@ def _check_rotation(pnp: PnpResult) -> None:
             f"too few usable landmarks: {int(pnp.inliers.sum())} of {len(pnp.inliers)} agree, but they fix the "
             f"rotation only to {pnp.rotation_deviation_deg:.0f}°, and no outlines help. Take a view that shows more "
             "landmarks, give more of them by hand (--landmarks), or name the bones of the label map under `ct.bones`."
+        )
+
+
+def _check_sides(
+    anatomy: Anatomy,
+    landmarks: Mapping[str, Tensor],
+    names: Sequence[str],
+    seen: Tensor,
+    fitted: Callable[[Sequence[str], Tensor], PnpResult],
+) -> None:
+    """Raises `InputError` where landmarks (N, 2) that were picked in a view from a side may be those of the other side.
+
+    From a side, a body and its mirror image cast nearly the same shadow, and only perspective tells them apart: picked
+    with left and right exchanged, the landmarks of a pelvis gave poses 20° and 80 mm off, within 10 mm on the detector.
+    """
+    mirror = {mark.name: mark.mirror for mark in anatomy.landmarks}
+    both = [n for n, name in enumerate(names) if mirror.get(name) in landmarks]
+    own, other = [names[n] for n in both], [mirror[names[n]] for n in both]
+    try:
+        gain = fitted(own, seen[both]).misfit - fitted(other, seen[both]).misfit
+    except InputError:  # too few of them, or none of the other side fits
+        return
+    if gain > -_SURE_OF_SIDES:
+        how = "better" if gain > _SURE_OF_SIDES else "about as well"
+        raise InputError(
+            f"landmarks in the image: with left and right exchanged they fit {how}. This view is taken from a side, "
+            "where the two lie one over the other: look again which is nearer to the source (and is shown larger), or "
+            "put a view from the front or from behind first."
         )
 
 

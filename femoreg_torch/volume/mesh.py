@@ -23,19 +23,26 @@ _MARGIN = 2  # empty voxels around the mesh
 
 
 def check_closed(mesh: "trimesh.Trimesh", where: str) -> "trimesh.Trimesh":
-    """`mesh` itself, with outward normals, if it is closed. Raises `InputError` that names `where` if it is not."""
+    """`mesh` itself, with outward normals, if it is closed. Raises `InputError` that names `where` if it is not.
+
+    Bodies may touch or overlap, as those of an assembly in one file do: every edge is to be run through as often one
+    way as the other. What lies in two bodies lies inside, once.
+    """
     if len(mesh.faces) == 0:
         raise InputError(f"{where}: the mesh holds no triangle.")
     if not np.isfinite(mesh.vertices).all():
         raise InputError(f"{where}: the mesh holds vertices that are not finite. Export it anew.")
-    if not mesh.is_watertight:
-        _, uses = np.unique(mesh.edges_unique_inverse, return_counts=True)
-        raise InputError(
-            f"{where}: the mesh is open ({np.count_nonzero(uses != 2)} of {len(uses)} edges do not join two faces). "
-            "Close its holes in the CAD program; only a closed surface has an inside."
-        )
-    if not mesh.is_winding_consistent:
-        raise InputError(f"{where}: the faces of the mesh disagree about which side is out. Unify its normals.")
+    if not (mesh.is_watertight and mesh.is_winding_consistent):
+        edges = mesh.edges_unique_inverse
+        uses = np.bincount(edges)
+        one_way = np.bincount(edges, np.where(mesh.edges[:, 0] < mesh.edges[:, 1], 1, -1))
+        if (uses % 2).any():
+            raise InputError(
+                f"{where}: the mesh is open ({np.count_nonzero(uses % 2)} of {len(uses)} edges do not join two faces). "
+                "Close its holes in the CAD program; only a closed surface has an inside."
+            )
+        if one_way.any():
+            raise InputError(f"{where}: the faces of the mesh disagree about which side is out. Unify its normals.")
     if mesh.volume < 0:
         mesh = mesh.copy()
         mesh.invert()

@@ -128,5 +128,7 @@ def _bodies(scene: "trimesh.Scene", path: Path) -> "dict[str, trimesh.Trimesh]":
         mesh.apply_transform(place)
         mesh.apply_scale(mm)
         mesh.merge_vertices()
+        a, b, c = mesh.faces.T
+        mesh.update_faces((a != b) & (b != c) & (c != a))  # slivers whose corners became one in the file's float32
         bodies[name] = mesh
     return bodies

@@ -100,6 +100,12 @@ def test_bad_tables(tmp_path: Path) -> None:
         ("femur_right", "femur_right"),
         ("hip-left", "hip_left"),
         ("SACRUM", "sacrum"),
+        ("Femur (Right)", "femur_right"),
+        ("rt. femur", "femur_right"),
+        ("Bone, hip; left", "hip_left"),
+        ("Vertebrae L5", "vertebrae"),
+        ("l5 femur", None),
+        ("femur", None),
         ("liver", None),
     ],
 )

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from femoreg_torch.configs import preset_names
 from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
@@ -117,6 +118,15 @@ def test_a_c_arm_may_stand_in_a_file_and_extend_a_preset(tmp_path):
     (tmp_path / "odd.yaml").write_text("extends: cios_fusion\nsdd: 990\n")
     with pytest.raises(InputError, match=r"odd.yaml: unknown key 'sdd'"):
         load_carm(tmp_path / "odd.yaml")
+
+
+@pytest.mark.parametrize("name", preset_names("carm"))
+def test_presets_are_those_of_mobile_c_arms(name):
+    """All that ship have flat panels of 30 cm, and an isocentre between half the source distance and two thirds."""
+    carm = load_carm(name)
+    sides = [n * mm for n, mm in zip(carm.camera.shape, carm.camera.pixel_mm, strict=True)]
+    assert sides == pytest.approx([297, 297], abs=3)
+    assert 0.5 < carm.isocentre_mm[2] / carm.camera.sdd_mm < 0.67
 
 
 def test_an_unknown_preset_lists_those_there_are():

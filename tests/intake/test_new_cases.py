@@ -18,6 +18,7 @@ from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.fluoro import Display
 from femoreg_torch.intake import inspect_path
+from femoreg_torch.intake.volumes import fitting_tables
 from femoreg_torch.volume import read_ct, read_labels
 
 
@@ -186,7 +187,7 @@ def test_other_forms_give_the_same_bones(files: Path, tmp_path: Path, changes: d
             ["--ct is missing", "--plan is missing", "--device-points is"],
         ),
         ({"labels": "none.nii.gz", "material": "steel", "hu": 3}, ["--labels: there is no", "--material and --hu"]),
-        ({"labels": "labels.nii.gz"}, ["--bones: is missing", "no shipped table fits"]),
+        ({"labels": "labels.nii.gz"}, ["--bones: is missing", "hip bones and femora of femoreg"]),
         ({"images": ["plain/run1"]}, ["3 files, but there are 1 images without the device"]),
         ({"images": ["view1.png", "view2.png", "view3.png"]}, ["--carm: is missing, and view1.png is no DICOM file"]),
         ({"guide": "upwards"}, ["guide: one of along the planned path"]),
@@ -229,7 +230,9 @@ def test_headers_say_side_and_values_and_flags_may_say_otherwise(
     found = inspect_path(tmp_path / "images" / "run1")
     assert any("the patient's posterior side" in fact for fact in found.facts)
     assert any("shown: the first frame" in fact for fact in found.facts)
-    assert "holds 2 frames, one was expected" in made("cine")
+    told = made("cine")
+    assert "holds 2 frames, one was expected" in told
+    assert "To new-case, this is said by --frames." in told
     assert "the patient's posterior side, by the header of run1" in made("behind", frames="mean")
     case = read_case(tmp_path / "behind")
     assert (case.display, case.views[0].frames, case.views[0].intensity) == (Display("posterior"), "mean", None)
@@ -243,6 +246,13 @@ def test_headers_say_side_and_values_and_flags_may_say_otherwise(
     assert content["display"] == {"source": "anterior", "mirrored": False, "turned": 90, "ignore_header": True}
     assert [view["frames"] for view in content["views"]] == [1, 1]
     assert "holds intensities (raw) by its PixelInt" in made("logs", frames=1, intensity="log")
+    for n in (1, 2):
+        write_dicom_image(tmp_path / f"images/run{n}", n, PatientOrientation=["H", "R"])  # L, F, mirrored, turned
+    assert "the pictures are mirrored and turned by 90°, by PatientOrientation" in made("turned")
+    assert read_case(tmp_path / "turned").display == Display("anterior", mirrored=True, turned_deg=90)
+    told = made("otherwise", turned=180)
+    assert "does not fit the display" in told
+    assert "said by --source, --mirrored, --turned or --ignore-header." in told
     for n in (1, 2):
         write_dicom_image(tmp_path / f"images/run{n}", n, Modality="DX")
     assert any("does not say what its values are" in one for one in inspect_path(tmp_path / "images/run1").warnings)
@@ -337,3 +347,29 @@ def test_in_a_terminal_what_is_missing_is_asked_for(
     case = read_case(tmp_path / "case")
     assert len(case.views) == 2
     assert "device" not in case.objects
+
+
+def test_a_table_fits_where_the_hips_do_though_other_bones_lie_outside() -> None:
+    assert fitting_tables([25, 75, 76, 77, 78]) == ["totalsegmentator_v2"]  # no vertebrae, half a sacrum
+    assert fitting_tables([75, 76, 77]) == []
+
+
+def test_a_folder_as_it_was_exported(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Images by their numbers; what holds none is passed over, and told."""
+    for kind, seed in (("plain", 1), ("device", 20)):
+        (tmp_path / kind / "DICOM").mkdir(parents=True)
+        for n in (2, 10, 1):
+            write_dicom_image(tmp_path / kind / f"DICOM/IM{n}", seed + n)
+        (tmp_path / kind / "README").write_text("A viewer for this disc.")
+        report = dataset("1.2.840.10008.5.1.4.1.1.88.67", "SR", generate_uid())
+        report.save_as(tmp_path / kind / "dose", enforce_file_format=True)
+    given = {"images": [tmp_path / "plain"], "device_images": [tmp_path / "device"]}
+    assert main(arguments(files, tmp_path / "case", **given)) == 0
+    told = capsys.readouterr().out
+    assert "passed over README, dose, which hold no image" in told
+    assert "view 2 is DICOM/IM2, with the device DICOM/IM2" in told
+    assert "view 3 is DICOM/IM10, with the device DICOM/IM10" in told
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "README").write_text("nothing")
+    assert main(arguments(files, tmp_path / "none", images=[tmp_path / "empty"])) == 2
+    assert "empty: a folder without images" in capsys.readouterr().err

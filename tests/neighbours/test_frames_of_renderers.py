@@ -1,4 +1,4 @@
-"""Poses of DiffDRR and nanodrr against what these programs themselves project and render (extra `bench`)."""
+"""Poses of DiffDRR, nanodrr and xvr against what these programs themselves make of them (extra `bench`; xvr apart)."""
 
 from pathlib import Path
 
@@ -10,7 +10,14 @@ from torch import Tensor
 
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Camera, exp_se3, project_points, transform_points
-from femoreg_torch.neighbours.frames import diffdrr_offsets, to_diffdrr, to_nanodrr, to_nanodrr_intrinsics, to_xvr
+from femoreg_torch.neighbours.frames import (
+    diffdrr_offsets,
+    from_xvr,
+    to_diffdrr,
+    to_nanodrr,
+    to_nanodrr_intrinsics,
+    to_xvr,
+)
 
 float64 = torch.float64
 CAMERA = Camera(1000.0, (1.3, 1.1), (121, 134), (60.0, 75.0))  # rows are odd; the principal point lies off the middle
@@ -100,6 +107,24 @@ def test_diffdrr_casts_rays_projects_and_renders_as_here(
     rotation, translation = to_xvr(pose, display, middle, reverse_x_axis=reverse_x_axis, orientation=orientation)
     by_xvr = convert(rotation[None], translation[None], parameterization="euler_angles", convention="ZXY")
     torch.testing.assert_close(by_xvr.matrix[0], matrix)  # as xvr's `FixedPose` makes it
+
+
+@pytest.mark.parametrize("display", DISPLAYS, ids=str)
+def test_poses_that_xvr_refines_are_those_told_and_come_back(
+    scan: tuple[Path, Tensor, Tensor], display: Display
+) -> None:
+    module = pytest.importorskip("xvr.register.pose", reason="no xvr here")
+    from diffdrr.pose import RigidTransform
+
+    middle, pose = scan[1], pose_of(display, scan[1])
+    told = {"reverse_x_axis": False, "orientation": "AP" if display.flipped else "PA"}
+    theirs = module.Pose(RigidTransform(to_diffdrr(pose, display, middle, **told)), "euler_angles", "ZXY")
+    rotation, translation = to_xvr(pose, display, middle, **told)
+    torch.testing.assert_close(theirs._rot[0].detach(), rotation)
+    torch.testing.assert_close(theirs._xyz[0].detach(), translation)
+    torch.testing.assert_close(
+        from_xvr(theirs._rot[0].detach(), theirs._xyz[0].detach(), display, middle, **told), pose
+    )
 
 
 @pytest.mark.parametrize("display", DISPLAYS, ids=str)

@@ -1,6 +1,7 @@
 """One scene stored in every way: the images inside, their fields and the start from landmarks are the same."""
 
 import itertools
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +16,15 @@ from femoreg_torch.anatomy import HIP
 from femoreg_torch.case import Case, CaseObject, Model, Start, View, read_case, write_case
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Circle, Display, write_image
-from femoreg_torch.geometry import Camera, CArm, exp_se3, project_points, transform_points
+from femoreg_torch.geometry import Camera, CArm, exp_se3, project_points, rotation_angle, transform_points
 from femoreg_torch.registration.prepare import read_images
 from femoreg_torch.registration.start import start_by_landmarks
 
 float64 = torch.float64
 CAMERA = Camera(1000.0, (1.5, 1.4), (40, 50), (26.0, 18.0))  # as the source sees it; nothing of it is symmetric
+LEFT_HALF = [  # an adult pelvis, LPS mm: FH, GSN, IOF, MOF, SPS, IPS, ASIS
+    [90.0, -10, -80], [75, 15, -25], [48, 10, -120], [30, -10, -112], [4, -45, -108], [4, -20, -120], [125, -75, -25]
+]  # fmt: skip
 RAW = 4 * torch.randint(250, 15000, (40, 50), generator=torch.Generator().manual_seed(0))
 DISPLAYS = [
     Display(source, mirrored, turned)  # type: ignore[arg-type]
@@ -115,6 +119,34 @@ def test_landmarks_in_the_stored_picture_start_from_every_side(tmp_path: Path, d
     wrong = replace(case, display=Display(display.source, not display.mirrored, display.turned_deg))
     with pytest.raises(InputError, match="landmarks"):
         start_by_landmarks(wrong, "pelvis", dict(zip(HIP.landmark_names, stored, strict=True)))
+
+
+@pytest.mark.parametrize("source", ["left", "right"])
+@pytest.mark.parametrize("tilt_deg", [0, 40])
+def test_from_a_side_landmarks_with_left_and_right_exchanged_are_told(
+    tmp_path: Path, source: str, tilt_deg: float
+) -> None:
+    """A pelvis is its own mirror image, and 40° of tilt are those of a cross-table view."""
+    camera = replace(CAMERA, pixel_mm=(0.5, 0.5), shape=(700, 600), principal_point_px=(300.0, 350.0))
+    half = torch.tensor(LEFT_HALF, dtype=float64)
+    points = torch.stack([half, half * torch.tensor([-1.0, 1, 1], dtype=float64)], 1).flatten(0, 1)
+    display = Display(source)  # type: ignore[arg-type]
+    forward, down = torch.tensor(display.beam, dtype=float64), torch.tensor([0.0, 0, -1], dtype=float64)
+    truth = torch.eye(4, dtype=float64)
+    tilt = exp_se3(torch.tensor([math.radians(tilt_deg), 0.05, 0, 0, 0, 0], dtype=float64))
+    truth[:3, :3] = tilt[:3, :3] @ torch.stack([torch.linalg.cross(down, forward), down, forward])
+    truth[:3, 3] = torch.tensor([5.0, -8, 700], dtype=float64) - truth[:3, :3] @ points.mean(0)
+    noise = 3 * torch.randn(14, 2, generator=torch.Generator().manual_seed(2), dtype=float64)  # 1.5 mm
+    seen = display.pixels_to_stored(project_points(camera, transform_points(truth, points)) + noise, camera)
+    carm = CArm(camera, (0.0, 0.0, 620.0), (0.0, 1.0, 0.0))
+    landmarks = dict(zip(HIP.landmark_names, points, strict=True))
+    case = Case(tmp_path, carm, {}, (View({}),), HIP, landmarks=landmarks, display=display)
+    found = start_by_landmarks(case, "pelvis", dict(zip(HIP.landmark_names, seen, strict=True)))
+    turned = found.camera1_from_object[:3, :3] @ truth[:3, :3].mT
+    assert torch.rad2deg(rotation_angle(turned)) < 4
+    exchanged = dict(zip(HIP.landmark_names, seen.view(7, 2, 2).flip(1).flatten(0, 1), strict=True))
+    with pytest.raises(InputError, match="with left and right exchanged they fit better"):
+        start_by_landmarks(case, "pelvis", exchanged)
 
 
 def test_a_header_against_the_case(tmp_path: Path) -> None:

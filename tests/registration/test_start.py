@@ -10,6 +10,7 @@ from femoreg_torch.anatomy import HIP
 from femoreg_torch.case import Case, CaseObject, View
 from femoreg_torch.detect import Detection
 from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import CArm, centred_camera, project_points, rotation_angle, transform_points
 from femoreg_torch.registration import RigidObject, Scene
 from femoreg_torch.registration.start import find_start, start_by_detection, start_by_landmarks
@@ -54,6 +55,12 @@ def detection(visible: int, inverted: bool) -> Detection:
 def test_too_few_landmarks_are_refused() -> None:
     with pytest.raises(InputError, match=r"view1.tif: 3 usable landmarks found, at least 4"):
         start_by_detection(hip_case(), scene(), detection(3, inverted=False))
+
+
+def test_a_view_from_a_side_asks_for_landmarks_by_hand() -> None:
+    case = replace(hip_case(), display=Display("left"))
+    with pytest.raises(InputError, match=r"taken from a side, .* \(--landmarks\)"):
+        start_by_detection(case, scene(), detection(3, inverted=False))
 
 
 def test_inverted_grey_values_are_refused_however_many_landmarks_there_are() -> None:

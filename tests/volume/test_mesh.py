@@ -70,6 +70,34 @@ def test_an_open_mesh_is_refused(tmp_path: Path) -> None:
         voxelise_mesh(ball, 0.5, 5000)
 
 
+def test_bodies_of_an_assembly_may_touch_in_a_face_or_an_edge(tmp_path: Path) -> None:
+    places = [(0, 0, 0), (10, 0, 0), (10, 10, 0), (20, 20, 0)]  # a wall between the first three, then only an edge
+    boxes = [trimesh.creation.box((10, 10, 10), transform=np.eye(4)).apply_translation(place) for place in places]
+    trimesh.util.concatenate(boxes).export(tmp_path / "device.stl")
+    mesh = read_mesh(tmp_path / "device.stl")
+    assert not mesh.is_watertight  # by trimesh, for whom an edge joins two faces
+    volume = voxelise_mesh(mesh, 0.5, 5000)
+    assert (volume.data / MU).sum() * 0.125 == pytest.approx(4000, rel=1e-6)
+    assert (volume.data / MU).max() == pytest.approx(1)
+
+
+def test_triangles_without_an_area_are_left_out(tmp_path: Path) -> None:
+    box = trimesh.creation.box((10, 6, 4))
+    corner, other = box.vertices[box.faces[0, :2]]
+    sliver = trimesh.Trimesh([corner, corner + 1e-12, other], [[0, 1, 2]], process=False)
+    trimesh.util.concatenate([box, sliver]).export(tmp_path / "device.stl")
+    assert read_mesh(tmp_path / "device.stl").volume == pytest.approx(240)
+
+
+def test_faces_that_disagree_are_refused(tmp_path: Path) -> None:
+    box = trimesh.creation.box((10, 6, 4))
+    faces = box.faces.copy()
+    faces[0] = faces[0, ::-1]
+    trimesh.Trimesh(box.vertices, faces, process=False).export(tmp_path / "device.stl")
+    with pytest.raises(InputError, match="disagree about which side is out"):
+        read_mesh(tmp_path / "device.stl")
+
+
 @pytest.mark.parametrize("content", [b"", b"solid nothing\nendsolid nothing\n", b"\x00\x01garbage" * 3])
 def test_what_is_no_mesh_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "device.stl").write_bytes(content)
