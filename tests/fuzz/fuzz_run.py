@@ -1,4 +1,4 @@
-"""Broken files given to what reads them, one after another, in processes that may crash or hang: `fuzz_run.py SEED COUNT`.
+"""Broken files given to what reads them, in processes that may crash or hang: `fuzz_run.py SEED COUNT [FIRST]`.
 
 This process imports and reads everything once, then forks, so that a crash costs a millisecond in place of seconds. Its
 child says which file it takes and what became of it; where it dies, or says nothing for too long, another goes on with
@@ -135,8 +135,8 @@ def _child(made: Sequence[Door], valid: Mapping[str, bytes], seed: int, numbers:
         yield f"ends the process, with {code}" if code != -signal.SIGKILL else f"says nothing for {_SILENT_S:.0f} s"
 
 
-def run(folder: Path, seed: int, count: int) -> dict[str, Any]:
-    """Read so many broken files, below `folder`; what is printed, see above."""
+def run(folder: Path, seed: int, count: int, first: int = 0) -> dict[str, Any]:
+    """Read so many broken files, below `folder`, from the number `first` on; what is printed, see above."""
     made = doors(folder)
     valid = {door.name: door.path.read_bytes() for door in made}
     with own_stderr() as printed:
@@ -144,9 +144,9 @@ def run(folder: Path, seed: int, count: int) -> dict[str, Any]:
             outcome(door, printed)  # all is imported now
     counts: Counter[tuple[str, str]] = Counter()
     finds = []
-    number = 0
-    while number < count:
-        for found in _child(made, valid, seed, range(number, min(number + _BATCH, count))):
+    number, end = first, first + count
+    while number < end:
+        for found in _child(made, valid, seed, range(number, min(number + _BATCH, end))):
             door = made[number % len(made)]
             counts[door.name, found if found in ("taken", "refused") else "find"] += 1
             if found not in ("taken", "refused"):
@@ -166,4 +166,4 @@ def run(folder: Path, seed: int, count: int) -> dict[str, Any]:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as place:
-        print(json.dumps(run(Path(place), int(sys.argv[1]), int(sys.argv[2]))))
+        print(json.dumps(run(Path(place), *map(int, sys.argv[1:]))))
