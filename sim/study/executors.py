@@ -81,7 +81,8 @@ class OnCluster:
                 "`dask scheduler` prints."
             ) from error
         with _quiet("distributed.client"), client:
-            _check_packages(client.get_versions(packages=_OURS), self.address)
+            versions: Any = client.get_versions(packages=_OURS)  # no coroutine, as the client is none of asyncio
+            _check_packages(versions, self.address)
             _check_workers(client.scheduler_info(n_workers=-1)["workers"], self.address)
             waiting = {client.submit(_perform, work, store, batch, pure=False): (batch, batch) for batch in todo}
             finished = as_completed(waiting, loop=client.loop)
