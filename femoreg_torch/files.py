@@ -22,6 +22,7 @@ from femoreg_torch.text import MOST_JSON_BYTES, json_content, read_bytes
 
 _RANDOM_PART = "????????"  # of a name by tempfile.mkdtemp
 _SUFFIX = ".part"
+_LONGEST_NAME = 240  # bytes; Linux allows 255, and the hidden folder beside has a name that is longer by 15
 _LOCK, _NEW, _OLD = "lock", "new", "old"  # what a workshop holds: a lock, what is being written, what it replaces
 
 
@@ -29,14 +30,54 @@ _LOCK, _NEW, _OLD = "lock", "new", "old"  # what a workshop holds: a lock, what 
 def temporary_file(path: Path) -> Iterator[Path]:
     """A path of the same name in a hidden folder beside `path`; what the caller writes there is renamed to `path`.
 
-    If the block fails, `path` is as it was. Raises `InputError` if the folder of `path` does not exist.
+    If the block fails, `path` is as it was. Raises `InputError` as `check_files` does.
     """
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: cannot be written, there is no folder {path.parent}. Make it first.")
+    check_files(path)
     with _workshop(path) as workshop:
         part = workshop / _NEW / path.name
         yield part
         part.replace(path)
+
+
+@contextmanager
+def temporary_files(*paths: Path) -> Iterator[tuple[Path, ...]]:
+    """Like `temporary_file`, for files of one folder that belong together: all of them are new, or all are as before.
+
+    The others describe the first. A run that is killed just while they are renamed leaves the first, old or new,
+    without some of the others, and never beside what describes another.
+    """
+    check_files(*paths)
+    with _workshop(paths[0]) as workshop:
+        parts = tuple(workshop / _NEW / path.name for path in paths)
+        yield parts
+        aside = workshop / "aside"
+        aside.mkdir()
+        there = [path for path in paths if os.path.lexists(path)]
+        try:
+            for path in there:
+                (_link if path == paths[0] else os.rename)(path, aside / path.name)
+            for part, path in zip(parts, paths, strict=True):
+                part.replace(path)
+        except BaseException:
+            for path in paths:
+                if os.path.lexists(aside / path.name):
+                    (aside / path.name).replace(path)
+                elif path not in there:
+                    path.unlink(missing_ok=True)
+            raise
+
+
+def check_files(*paths: Path) -> None:
+    """Raises `InputError` where no file of such a name can be; for commands that compute long before they write."""
+    for path in paths:
+        if len(os.fsencode(path.name)) > _LONGEST_NAME:
+            raise InputError(f"{shortened(path, 200)}: this name is too long. Choose another one.")
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: cannot be written, there is no folder {path.parent}. Make it first.")
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: is there and is no file, so it is not replaced. Choose another name.")
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise InputError(f"{path}: cannot be written, {path.parent} is not yours. Choose another place.")
 
 
 @contextmanager
@@ -66,10 +107,10 @@ def new_folder(path: Path, without: Collection[str] = ()) -> Iterator[Path]:
         _put_in_place(built, path, workshop / _OLD)
 
 
-def check_new_folder(path: Path) -> Path:
+def check_new_folder(path: Path, source: Path | None = None) -> Path:
     """The real path of a folder that `new_folder` can write; for commands that compute long before they write.
 
-    Raises `InputError` as `new_folder` does, and where nothing may be written.
+    Raises `InputError` as `new_folder` does, where nothing may be written, and for the folder `source` that is read.
     """
     try:
         real = path.resolve()  # so that the name and the parent of `.` and `out/..` are real ones
@@ -78,6 +119,8 @@ def check_new_folder(path: Path) -> Path:
         raise InputError(f"{shortened(path, 200)}: cannot be written ({shortened(error, 100)}).") from error
     if there and not real.is_dir():
         raise InputError(f"{real}: is a file, a folder was expected. Choose another name for the output.")
+    if there and source is not None and source.exists() and real.samefile(source):
+        raise InputError(f"{real}: is the folder that is read. Choose another one for the output.")
     if there and real.is_mount():
         raise InputError(f"{real}: is a mount point, which cannot be replaced as a whole. Choose a folder inside it.")
     above = next(parent for parent in real.parents if parent.exists())
@@ -133,6 +176,11 @@ def _working_folder(path: Path) -> Path | None:
     except FileNotFoundError:
         return None
     return here if here.is_relative_to(path) else None
+
+
+def named_as_asked(message: str) -> str:
+    """A message of the system with the names that were asked for in place of those in hidden folders beside them."""
+    return re.sub(r"/\.([^/]+)\.[a-z0-9_]{8}\.part(/new/\1)?(?![^/\s:'\"])", r"/\1", message)
 
 
 @contextmanager

@@ -36,11 +36,29 @@ _UNION = re.compile(
 )
 
 
+_REFUSED = re.compile(
+    r"(?:Expected an? (.*?)\.|(.*?) was expected\.)(?: Given value type: \S+)? (?:Given|Got) value: ?(.*)"
+)
+_KEY = re.compile(r'Parser key "([^"]*)": (.*)')
+_WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text"}
+
+
 def told(error: Exception) -> str:
-    """What jsonargparse says of a value, on one line, the middle of what is long left out."""
+    """What jsonargparse says of a value, on one line, the middle of what is long left out: key, expected, found."""
     text = _CLASS.sub(r"\1", " ".join(str(error).split()))
     text = _UNION.sub(lambda found: f"{found[1].replace(', NoneType', '')} was expected.", text)
+    if key := _KEY.fullmatch(text):
+        text = f"{key[1]}: {_REFUSED.sub(_in_words, key[2])}"
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST // 2]} … {text[-_LONGEST // 2 :]}"
+
+
+def _in_words(found: re.Match[str]) -> str:
+    kinds = found[1] or found[2]
+    if choice := re.fullmatch(r"typing\.Literal\[(.*)\]", kinds):
+        kinds = f"one of {choice[1]}"
+    else:
+        kinds = ", ".join(_WORDS.get(kind, kind) for kind in kinds.split(", "))
+    return f"{kinds} was expected, found {shortened(found[3])}"
 
 
 def read_record(kind: type[_T], content: dict[str, Any], where: str, ready: Mapping[str, Any] | None = None) -> _T:

@@ -15,8 +15,10 @@ def phantom(out: Path, *, seed: int = 1, side: Literal["left", "right"] = "left"
     """
     from rich.console import Console
 
+    from femoreg_torch.files import check_new_folder
     from sim.theatre.case_folders import write_phantom
 
+    check_new_folder(out)
     console = Console()
     with console.status("building the patient"):
         write_phantom(out, seed, side, spacing_mm)
@@ -45,8 +47,10 @@ def around_surfaces(
     """
     from rich.console import Console
 
+    from femoreg_torch.files import check_new_folder
     from sim.patient.around_surfaces import Options, write_patient_around
 
+    check_new_folder(out)
     console = Console()
     with console.status("building the patient"):
         write_patient_around(surfaces, out, Options(seed, spacing_mm, osteoporotic, below_mm))
@@ -67,8 +71,10 @@ def around_labels(label_map: Path, *, out: Path, labels: str, seed: int = 1, spa
     from rich.console import Console
 
     from femoreg_torch.anatomy import label_table
+    from femoreg_torch.files import check_new_folder
     from sim.patient.from_labels import write_label_patient
 
+    check_new_folder(out)
     table = label_table(labels)
     console = Console()
     with console.status("building the patient"):
@@ -100,8 +106,10 @@ def simulate(
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     from femoreg_torch.commands.telling import tell_device
+    from femoreg_torch.files import check_new_folder
     from sim.theatre.case_folders import SIMULATION_STEPS, write_simulation
 
+    check_new_folder(out, case)
     console = Console()
     place = tell_device(console, device)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())

@@ -1,6 +1,7 @@
 """The door for arrays: claims of headers are compared with what is there, and libraries print nothing."""
 
 import gzip
+import resource
 import struct
 import time
 import zlib
@@ -135,15 +136,33 @@ def test_images_that_claim_what_cannot_be(make, tmp_path: Path, capfd: pytest.Ca
     assert capfd.readouterr() == ("", "")
 
 
+def test_a_chunk_of_a_png_that_claims_four_gigabytes(tmp_path: Path) -> None:
+    path = png(tmp_path / "a.png", 12, 10)
+    content = path.read_bytes()
+    place = content.index(b"IDAT") - 4
+    path.write_bytes(content[:place] + b"\xff\xff\xff\xf0" + content[place + 4 :])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(InputError, match="damaged"):
+        read_image(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2**20  # kB
+
+
 def test_a_picture_cut_off_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     pixels = np.random.default_rng(0).integers(0, 4000, (50, 50), dtype=np.uint16)
-    for suffix in ("png", "tif"):
+    for suffix in ("png", "tif", "jpg", "bmp"):
         path = tmp_path / f"a.{suffix}"
-        cv2.imwrite(str(path), pixels)
+        cv2.imwrite(str(path), pixels if suffix in ("png", "tif") else (pixels // 16).astype(np.uint8))
         path.write_bytes(path.read_bytes()[:1000])
         with pytest.raises(InputError):
             read_image(path)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_mesh_with_a_corner_far_away(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    (tmp_path / "a.off").write_text("OFF\n4 4 0\n0 0 0\n9 0 0\n0 9 0\n0 0 1e300\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n")
+    with pytest.raises(InputError, match=r"a\.off: a corner lies 1e\+300 mm"):
+        read_mesh(tmp_path / "a.off")
+    assert len(recwarn) == 0
 
 
 def test_a_mesh_with_a_corner_that_is_not_there(tmp_path: Path) -> None:

@@ -11,10 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fuzz_faults import FAULT, fault
 
 from femoreg_torch import files
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import check_new_folder, new_folder, read_json, temporary_file, write_json, write_text
+from femoreg_torch.files import (
+    check_new_folder,
+    new_folder,
+    read_json,
+    temporary_file,
+    temporary_files,
+    write_json,
+    write_text,
+)
 
 
 def names(folder: Path) -> list[str]:
@@ -143,9 +152,18 @@ def write(text):
             (built / name).parent.mkdir(exist_ok=True)
             (built / name).write_text(text)
 """
-EVERY_STEP = (
-    WRITER
-    + """
+WRITER_OF_TWO = """
+import sys
+from pathlib import Path
+from femoreg_torch import files
+
+def write(text):
+    folder = Path(sys.argv[1])
+    with files.temporary_files(folder / "a.json", folder / "b.json") as parts:
+        for part in parts:
+            part.write_text(text)
+"""
+EVERY_STEP = """
 import os, signal
 
 def killed_at(step):
@@ -165,12 +183,11 @@ def killed_at(step):
 step = 1
 write("old")
 while killed_at(step):
-    found = [path.read_text() for path in sorted(Path(sys.argv[1]).glob("**/*.json"))]
+    found = [path.read_text() for path in sorted(Path(sys.argv[1]).glob("**/*.json")) if ".part" not in str(path)]
     print(step, *found, flush=True)
     write("old")
     step += 1
 """
-)
 FOR_EVER = (
     WRITER
     + """
@@ -188,7 +205,7 @@ def test_killed_at_every_step_a_writer_leaves_all_old_or_all_new(tmp_path: Path,
     """
     run = tmp_path / "run"
     done = subprocess.run(
-        [sys.executable, "-c", EVERY_STEP, str(run), way], capture_output=True, encoding="utf-8", check=True
+        [sys.executable, "-c", WRITER + EVERY_STEP, str(run), way], capture_output=True, encoding="utf-8", check=True
     )
     found = [tuple(line.split()[1:]) for line in done.stdout.splitlines()]
     assert found.count(("old", "old")) > 10
@@ -244,6 +261,58 @@ def test_a_file_in_a_folder_that_is_not_there(tmp_path: Path) -> None:
         write_text(tmp_path / "no" / "a.txt", "text")
 
 
+def contents(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in sorted(folder.iterdir())}
+
+
+@pytest.mark.parametrize("old", [{}, {"a": "old", "b": "old", "c": "old"}, {"b": "old"}])
+def test_files_that_belong_together_are_all_old_or_all_new_whichever_step_fails(
+    old: dict[str, str], tmp_path: Path
+) -> None:
+    for n in range(1, 40):
+        for path in tmp_path.iterdir():
+            path.unlink()
+        for name, text in old.items():
+            (tmp_path / name).write_text(text)
+        with fault(tmp_path, n):
+            try:
+                with temporary_files(*(tmp_path / name for name in "abc")) as parts:
+                    for part in parts:
+                        part.write_text("new")
+                found = dict.fromkeys("abc", "new")
+            except OSError:
+                found = old
+            happened = FAULT.left == 0
+        assert contents(tmp_path) == found
+        if not happened:
+            assert n > 8
+            return
+    raise AssertionError("more steps than expected")
+
+
+def test_killed_at_every_step_no_file_stands_beside_one_that_it_does_not_describe(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WRITER_OF_TWO + EVERY_STEP, str(tmp_path)],
+        capture_output=True,
+        encoding="utf-8",
+        check=True,
+    )
+    found = {tuple(line.split()[1:]) for line in done.stdout.splitlines()}
+    assert {("old", "old"), ("new", "new")} <= found <= {("old", "old"), ("new", "new"), ("old",), ("new",)}
+    assert names(tmp_path) == ["a.json", "b.json"]
+
+
+@pytest.mark.parametrize("kind", ["folder", "device", "pipe", "long"])
+def test_what_is_no_file_is_not_replaced(kind: str, tmp_path: Path) -> None:
+    path = {"device": Path("/dev/null"), "long": tmp_path / ("x" * 250)}.get(kind, tmp_path / kind)
+    if kind == "folder":
+        path.mkdir()
+    if kind == "pipe":
+        os.mkfifo(path)
+    with pytest.raises(InputError, match=r"is not replaced|too long"):
+        write_text(path, "text")
+
+
 def test_json_is_readable_and_exact_to_nine_decimals(tmp_path: Path) -> None:
     content = {
         "T": torch.eye(4, dtype=torch.float64) / 3,
@@ -279,3 +348,13 @@ def test_where_no_folder_can_be_is_told_before_anything_is_computed(tmp_path: Pa
         pass
     assert names(tmp_path) == ["file", "loop"]
     assert check_new_folder(tmp_path / "new" / "run") == tmp_path.resolve() / "new" / "run"
+
+
+def test_the_folder_that_is_read_is_not_written(tmp_path: Path) -> None:
+    (tmp_path / "case").mkdir()
+    (tmp_path / "link").symlink_to("case")
+    for out in (tmp_path / "case", tmp_path / "link", tmp_path / "case" / "run" / ".."):
+        with pytest.raises(InputError, match="is the folder that is read"):
+            check_new_folder(out, tmp_path / "case")
+    check_new_folder(tmp_path / "case" / "run", tmp_path / "case")
+    check_new_folder(tmp_path / "case", tmp_path / "nowhere")

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError
 
 _STATE = ("epoch", "loops", "optimizer_states", "lr_schedulers")  # what Lightning goes on from, beside the weights
@@ -15,7 +16,8 @@ _STATE = ("epoch", "loops", "optimizer_states", "lr_schedulers")  # what Lightni
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """The content of a checkpoint, plain values alone. Raises `InputError` if it is cut off or another file."""
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)  # plain containers and tensors alone
+        with quiet():
+            content = torch.load(path, map_location="cpu", weights_only=True)  # plain containers and tensors alone
     except Exception as error:  # of zip, pickle, or torch, by where the file is damaged
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputError(f"{path}: is cut off, damaged, or no checkpoint ({reason}).") from error

@@ -77,6 +77,7 @@ def measure(
 
     from femoreg_torch.detect import load_network
     from femoreg_torch.errors import InputError
+    from femoreg_torch.files import check_new_folder
     from training.accuracy_page import write_accuracy
     from training.labelled import images_of_file
     from training.measure import Reading, read_images
@@ -85,6 +86,7 @@ def measure(
 
     if register and len(register) != len(images):
         raise InputError(f"--register: {len(register)} folders for {len(images)} files of images; one each is needed.")
+    check_new_folder(out)
     network = load_network(weights)
     readings: list[Reading] = []
     for number, path in enumerate(images):

@@ -41,6 +41,7 @@ def detect(
     from femoreg_torch.detect import detect as find
     from femoreg_torch.detect.writing import write_detections
     from femoreg_torch.errors import InputError
+    from femoreg_torch.files import check_new_folder
     from femoreg_torch.fluoro import (
         Display,
         attenuation_image,
@@ -52,6 +53,7 @@ def detect(
     from femoreg_torch.geometry import load_carm
     from femoreg_torch.pnp import MINIMUM
 
+    check_new_folder(out)
     images = [file for path in images for file in _files(path)]
     repeated = {path.stem for path in images if sum(path.stem == other.stem for other in images) > 1}
     if repeated:

@@ -24,6 +24,7 @@ def inspect(path: Path, *, out: Path = Path("inspect.png"), series: str | None =
 
     from femoreg_torch.intake import inspect_path
 
+    _check_picture(out, path)
     console = Console(soft_wrap=True)
     found = inspect_path(path, series)
     console.print(f"[bold]{escape(str(path))}[/]: {escape(found.kind)}")
@@ -55,6 +56,7 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     from femoreg_torch.commands.status import AMISS, DONE
     from femoreg_torch.intake import check_case
 
+    _check_picture(out, case)
     console = Console(soft_wrap=True)
     pixels = None if landmarks is None else read_pixels(landmarks)
     found = check_case(case, find_start=not fast, landmarks=pixels)
@@ -75,16 +77,31 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     return DONE
 
 
+def _check_picture(out: Path, source: Path) -> None:
+    """Raises `InputError` for a name that is none of a picture, or is that of what the picture is made of."""
+    from femoreg_torch.errors import InputError
+    from femoreg_torch.text import MOST_YAML_BYTES, read_bytes
+
+    if out.suffix.lower() not in (".png", ".jpg"):
+        raise InputError(f"{out}: a name that ends in .png was expected. Choose another with --out.")
+    if not (out.exists() and source.exists()):
+        return
+    form = source / "case.yaml"
+    in_case = form.is_file() and out.parent.samefile(source)
+    if out.samefile(source) or (in_case and out.name.encode() in read_bytes(form, MOST_YAML_BYTES)):
+        raise InputError(f"{out}: is what the picture is made of. Choose another name with --out.")
+
+
 def write_picture(path: Path, picture: "Picture") -> None:
+    """Write a picture (PNG or JPEG, by its name), whole or not at all."""
     import cv2
 
-    from femoreg_torch.errors import InputError
     from femoreg_torch.files import temporary_file
 
-    if path.suffix.lower() not in (".png", ".jpg"):
-        raise InputError(f"{path}: a name that ends in .png was expected. Choose another with --out.")
+    written, content = cv2.imencode(path.suffix, picture)
+    assert written
     with temporary_file(path) as part:
-        cv2.imwrite(str(part), picture)
+        part.write_bytes(content.tobytes())
 
 
 def new_case(

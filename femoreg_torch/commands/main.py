@@ -11,8 +11,10 @@ import ast
 import atexit
 import inspect
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -37,6 +39,8 @@ _RANGES = {  # of options that have one meaning in all commands
     "procedures": (1, 1_000_000),
     "devices": (1, 1024),
     "nodes": (1, 1024),
+    "volume_ml": (0.1, 100),  # of cement
+    "distance_mm": (0.01, 100),
 }
 
 
@@ -50,14 +54,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands = {command.name: command for command in entry_points(group=GROUP)}
     try:
-        if not arguments or arguments[0] in ("-h", "--help"):
-            print(_overview(commands))
-        elif arguments[0] == "--version":
-            print(f"femoreg {femoreg_torch.__version__}")
-        elif arguments[0] in commands:
-            return _run(commands[arguments[0]], arguments[1:])
-        else:
-            raise InputError(f"no command {shortened(arguments[0])}; there are: {', '.join(commands)}.")
+        try:
+            return _carry_out(arguments, commands)
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()  # what cannot be printed, on a full disk, is told now
     except InputError as error:
         return _complain(str(error))
     except ModuleNotFoundError as error:
@@ -76,6 +77,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except Exception as error:
         return _tell_defect(error)
+
+
+def _carry_out(arguments: list[str], commands: dict[str, EntryPoint]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview(commands))
+    elif arguments[0] == "--version":
+        print(f"femoreg {femoreg_torch.__version__}")
+    elif arguments[0] in commands:
+        return _run(commands[arguments[0]], arguments[1:])
+    else:
+        raise InputError(f"no command {shortened(arguments[0])}; there are: {', '.join(commands)}.")
     return DONE
 
 
@@ -85,6 +97,9 @@ def console_script() -> NoReturn:
     Taking modules and memory apart one by one takes more than a second after a registration, and the system does it at
     once. Before that, threads have ended, and all that was registered for the end has run.
     """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed by whoever started this; its number must not become that of a file
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115
     ended: list[int] = []
     atexit.register(_end, ended)  # what is registered first runs last
     ended.append(main())
@@ -92,8 +107,9 @@ def console_script() -> NoReturn:
 
 
 def _end(ended: Sequence[int]) -> None:
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # of which `main` has told, if it could
+            stream.flush()
     if ended:
         os._exit(ended[0])
 
@@ -108,10 +124,15 @@ def _tell_defect(error: Exception) -> int:
 
 def _complain(message: str) -> int:
     """Print one line on stderr, without what could steer a terminal."""
-    line = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in " ".join(message.split()))
+    from femoreg_torch.files import named_as_asked
+
+    line = "".join(
+        c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in " ".join(named_as_asked(message).split())
+    )
     if len(line) > _LONGEST:
         line = f"{line[: _LONGEST // 2]} … {line[-_LONGEST // 2 :]}"
-    print(f"femoreg: {line}".encode(errors="backslashreplace").decode(), file=sys.stderr)
+    with suppress(OSError):  # stderr may be full, or gone
+        print(f"femoreg: {line}".encode(errors="backslashreplace").decode(), file=sys.stderr)
     return BAD_INPUT
 
 
@@ -179,11 +200,17 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
 
     from femoreg_torch.settings import told
 
+    if any(word == "" or re.fullmatch(r"--[\w-]+=", word) for word in arguments):
+        raise InputError(f"{name}: an argument is empty. Is a variable of the shell not set?")
     parser = parser_of(function, name)
     try:
         values = parser.instantiate(parser.parse_args(arguments))
     except (ArgumentError, TypeError, ValueError, OSError) as error:  # OSError: a file of options that cannot be read
-        raise InputError(f"{name}: {told(error).rstrip('. ')}. See `femoreg {name} --help`.") from error
+        key, colon, rest = told(error).rstrip(". ").partition(":")
+        known = inspect.signature(function).parameters
+        if key in known and (known[key].kind is known[key].KEYWORD_ONLY or known[key].default is not known[key].empty):
+            key = f"--{key.replace('_', '-')}"
+        raise InputError(f"{name}: {key}{colon}{rest}. See `femoreg {name} --help`.") from error
     for key, (low, high) in _RANGES.items():
         if isinstance(value := values.get(key), int | float) and not low <= value <= high:
             raise InputError(f"{name}: --{key.replace('_', '-')}: {low:g} to {high:g} was expected, found {value:g}.")

@@ -21,7 +21,7 @@ def plan(case: Path, *, out: Path, volume_ml: float = 9.5, preset: str = "defaul
 
     from femoreg_torch.case import read_case
     from femoreg_torch.commands.telling import progress_report
-    from femoreg_torch.files import new_folder
+    from femoreg_torch.files import check_new_folder, new_folder
     from femoreg_torch.planning.figures import curves_figure, overlay_figure, save
     from femoreg_torch.planning.plan import make_plan
     from femoreg_torch.planning.prepare import prepare
@@ -29,6 +29,7 @@ def plan(case: Path, *, out: Path, volume_ml: float = 9.5, preset: str = "defaul
     from femoreg_torch.planning.settings import load_planning
 
     console = Console()
+    check_new_folder(out, case)
     content = read_case(case)
     prepared = prepare(content, load_planning(preset))
     with progress_report(console, "optimal cement") as report:

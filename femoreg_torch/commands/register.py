@@ -129,7 +129,7 @@ def register_into(
     from femoreg_torch.navigation import NAVIGATION_NAMES, navigation_content, read_robot, write_navigation
     from femoreg_torch.registration.run import network_detector, register_scene, silent
 
-    check_new_folder(out)
+    check_new_folder(out, case.folder)
     tool = None if case.plan is None else case.plan.tool
     calibration = None if robot is None or tool is None else read_robot(robot, tool)
     if robot is not None and (tool is None or not _is_seen(case, tool)):

@@ -47,14 +47,14 @@ def review(
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import check_new_folder
     from femoreg_torch.registration import load_plan, prepare_scene
-    from femoreg_torch.review import LOOPBACK, Desk, Order, review_app, serve
+    from femoreg_torch.review import LOOPBACK, Desk, Order, only_review, review_app, serve
 
     console = Console()
     of, run = _case_and_run(folder, case, out)
     place = tell_device(console, device)
     load_plan(preset)  # what is wrong with it is told now
-    check_new_folder(run)
-    with socket.socket() as listening:
+    check_new_folder(run, of)
+    with only_review(run), socket.socket() as listening:
         try:
             listening.bind((LOOPBACK, port))
         except (OSError, OverflowError) as error:

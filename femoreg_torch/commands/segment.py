@@ -25,7 +25,7 @@ def segment(
     from femoreg_torch.anatomy import HIP
     from femoreg_torch.commands.intake import write_picture
     from femoreg_torch.errors import InputError
-    from femoreg_torch.files import write_json
+    from femoreg_torch.files import check_files, temporary_files, write_json
     from femoreg_torch.intake.planes import three_planes
     from femoreg_torch.segment import load_bone_network, segment_bones
     from femoreg_torch.volume import read_ct_told
@@ -34,35 +34,40 @@ def segment(
     suffix = next((s for s in (".nii.gz", ".nii", ".nrrd", ".mha") if out.name.lower().endswith(s)), None)
     if suffix is None:
         raise InputError(f"{out}: the label map's name is to end in .nii.gz, .nrrd or .mha.")
-    if not out.parent.is_dir():
-        raise InputError(f"{out}: cannot be written, there is no folder {out.parent}. Make it first.")
+    stem = out.name[: -len(suffix)]
+
+    def beside(ending: str) -> Path:
+        return out.with_name(stem + ending)
+
+    check_files(out, beside(".json"), beside(".png"))
     if ct.exists() and out.exists() and out.samefile(ct):
         raise InputError(f"{out}: is the CT itself. Choose another name for the label map.")
     console = Console(soft_wrap=True)
     volume, told = read_ct_told(ct, series)
     with console.status("looking for bones"):
         found = segment_bones(volume, load_bone_network(weights), refine=not unrefined)
-    write_labels_like(out, found.labels, ct)
-    stem = out.with_name(out.name[: -len(suffix)])
-    write_json(
-        stem.with_name(stem.name + ".json"),
-        {
-            "labels": out.name,
-            "table": "femoreg",
-            "confidence": {bone: round(share, 3) for bone, share in found.confidence.items()},
-            "volume_ml": {bone: round(volume_ml, 1) for bone, volume_ml in found.volume_ml.items()},
-            "warnings": list(found.warnings),
-        },
-    )
+    about = {
+        "labels": out.name,
+        "table": "femoreg",
+        "confidence": {bone: round(share, 3) for bone, share in found.confidence.items()},
+        "volume_ml": {bone: round(volume_ml, 1) for bone, volume_ml in found.volume_ml.items()},
+        "warnings": list(found.warnings),
+    }
     colours = {1 + n: bone.colour for n, bone in enumerate(HIP.bones)}
-    write_picture(stem.with_name(stem.name + ".png"), three_planes(volume, found.labels, colours, {}))
+    planes = three_planes(volume, found.labels, colours, {})
+    with temporary_files(out, beside(".json"), beside(".png")) as (labels, text, picture):
+        write_labels_like(labels, found.labels, ct)
+        write_json(text, about)
+        write_picture(picture, planes)
     for note in told:
         console.print(f"  {escape(note)}", highlight=False)
     for bone, volume_ml in found.volume_ml.items():
         console.print(f"  {bone}: {volume_ml:.0f} ml, mean probability {found.confidence[bone]:.2f}", highlight=False)
     for warning in found.warnings:
         console.print(f"[yellow]Warning:[/] {escape(warning)}.", highlight=False)
-    console.print(f"Label map: {escape(str(out))}; look at {escape(stem.name)}.png before you use it.", highlight=False)
+    console.print(
+        f"Label map: {escape(str(out))}; look at {escape(beside('.png').name)} before you use it.", highlight=False
+    )
 
 
 def landmarks(ct: Path, labels: Path, *, out: Path, bones: str = "femoreg", series: str | None = None) -> None:

@@ -1,5 +1,6 @@
 """Reading and writing of fluoroscopic images."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,6 +15,7 @@ from femoreg_torch.arrays import MOST_PIXELS, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.fluoro.dicom import DicomImage, Frames, read_dicom, read_header
+from femoreg_torch.fluoro.png import chunks_are_there
 from femoreg_torch.fluoro.tags import Tags
 from femoreg_torch.geometry import Camera
 from femoreg_torch.text import read_bytes
@@ -45,12 +47,11 @@ class StoredImage:
 
 
 def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    content = np.frombuffer(read_bytes(path, _MOST_PICTURE_BYTES), np.uint8)
-    try:
-        with quiet():
-            image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if content.size else None
-    except (cv2.error, MemoryError):  # what OpenCV does with more pixels than it was told to allow
-        image = None
+    content = read_bytes(path, _MOST_PICTURE_BYTES)
+    image = None
+    if content and chunks_are_there(content):
+        with suppress(cv2.error, MemoryError), quiet():  # of more pixels than OpenCV was told to allow
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise InputError(
             f"{path}: cannot be read as a PNG, TIFF or JPEG image of at most {MOST_PIXELS} pixels; the file is damaged "

@@ -14,7 +14,8 @@ from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry.rigid import check_rigid, invert_rigid, rigid
 from femoreg_torch.text import read_bytes
 
-_MOST_BYTES = 2**16  # of a file with one transform
+_MOST_BYTES = 2**18  # of a file with one transform
+_MOST_NUMBERS = 64
 
 
 # Linear transforms in 3-D, and how many parameters they have. ITK crashes on files whose numbers are fewer.
@@ -51,14 +52,14 @@ def read_itk_transform(path: Path) -> Tensor:
 
 
 def check_transform_file(path: Path) -> None:
-    """Raises `InputError` for a text or MATLAB file that does not hold the numbers of one linear transform in 3-D."""
-    suffix = Path(path).suffix.lower()
-    if suffix not in (".tfm", ".txt", ".mat"):
-        return
+    """Raises `InputError` for a file that does not hold the numbers of one linear transform in 3-D."""
+    of_kind = _READERS.get(Path(path).suffix.lower())
+    if of_kind is None:
+        raise InputError(f"{path}: a name that ends in {', '.join(_READERS)} was expected.")
     content = read_bytes(path, _MOST_BYTES)
-    try:  # what SciPy's reader of MATLAB files raises for whatever its parsing runs into, and numbers that are none
-        kind, numbers, fixed = _of_matlab(content) if suffix == ".mat" else _of_text(content.decode("utf-8"))
-    except (UnicodeDecodeError, ValueError, TypeError, KeyError, OSError, NotImplementedError, MemoryError) as error:
+    try:  # what the readers of MATLAB and HDF5 files raise for whatever their parsing runs into
+        kind, numbers, fixed = of_kind(content)
+    except (ValueError, TypeError, KeyError, AttributeError, OSError, RuntimeError, MemoryError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: cannot be read as an ITK transform ({reason}).") from error
     name = kind.partition("_")[0]
@@ -71,10 +72,10 @@ def check_transform_file(path: Path) -> None:
         )
 
 
-def _of_text(content: str) -> tuple[str, int, int]:
+def _of_text(content: bytes) -> tuple[str, int, int]:
     """The kind of a transform, and how many finite parameters and fixed ones it has. Raises `ValueError`."""
     found: dict[str, str] = {}
-    for line in content.splitlines():
+    for line in content.decode("utf-8").splitlines():
         key, colon, value = line.partition(":")
         if line.startswith("#") or not line.strip():
             continue
@@ -99,3 +100,26 @@ def _of_matlab(content: bytes) -> tuple[str, int, int]:
     if not all(np.isfinite(np.asarray(value, dtype=float)).all() for value in found.values()):
         raise ValueError("its numbers are not all finite")
     return kind, int(np.size(found[kind])), int(np.size(found.get("fixed", ())))
+
+
+def _of_hdf5(content: bytes) -> tuple[str, int, int]:
+    """As `_of_text`, of an HDF5 file. Raises `ValueError`, and what h5py raises."""
+    import h5py  # of the extra `sim`
+
+    with h5py.File(io.BytesIO(content), "r") as file:
+        transforms = file["TransformGroup"]
+        if list(transforms) != ["0"]:
+            raise ValueError("one transform was expected")
+        transform = transforms["0"]
+        counts = []
+        for name in ("TransformParameters", "TransformFixedParameters"):
+            values = transform.get(name, transform.get(name.replace("Transform", "Tranform")))  # as older ITKs spell it
+            if values is None or values.size is None or values.size > _MOST_NUMBERS:
+                raise ValueError(f"{name} are not the numbers of a linear transform")
+            if not np.isfinite(values[()]).all():
+                raise ValueError(f"{name} are not all finite")
+            counts.append(int(values.size))
+        return str(transform["TransformType"].asstr()[0]), counts[0], counts[1]
+
+
+_READERS = {".tfm": _of_text, ".txt": _of_text, ".mat": _of_matlab, ".h5": _of_hdf5, ".hdf5": _of_hdf5}

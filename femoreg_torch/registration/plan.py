@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from femoreg_torch.configs import load_preset
+from femoreg_torch.errors import InputError
 from femoreg_torch.extensions import find, pop_kind, record_of
 from femoreg_torch.optimize import Optimiser, read_optimiser
 from femoreg_torch.registration.calibration import Calibration
@@ -54,6 +55,8 @@ def plan_from(name: str, content: dict[str, Any]) -> Plan:
     """The workflow of this name whose `steps` stand in `content`. Raises `InputError` that names it, step and key."""
     where = f"registration preset {name}"
     steps = read_record(_Content, content, where).steps
+    if not steps:
+        raise InputError(f"{where}, steps: none is left, so nothing would be registered. Name at least one.")
     return Plan(name, tuple(_step(step, f"{where}, step {i + 1}") for i, step in enumerate(steps)))
 
 

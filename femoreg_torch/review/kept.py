@@ -1,17 +1,54 @@
 """What a person has placed, kept beside the run until it is registered: files that `femoreg register` takes, too.
 
 `RUN.landmarks.csv` is for `--landmarks`, `RUN.start.json` for `--start`. So nothing is lost when the review is stopped.
+One review at a time keeps them.
 """
 
 import csv
+import fcntl
 import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from femoreg_torch.case import Case
 from femoreg_torch.case.start_files import COLUMNS, read_pixels, read_start_poses
+from femoreg_torch.errors import InputError
 from femoreg_torch.files import write_json, write_text
 from femoreg_torch.registration import Scene
 from femoreg_torch.review.placing import Placed, as_stored, at_given, in_camera
+
+
+@contextmanager
+def only_review(run: Path) -> Iterator[None]:
+    """Raises `InputError` while another process reviews the same run.
+
+    The system takes the lock from a process that ends, however it ends. A file system without locks lets all in.
+    """
+    run = run.resolve()
+    run.parent.mkdir(parents=True, exist_ok=True)
+    path = run.with_name(f".{run.name}.review")
+    while True:
+        lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(lock)
+            raise InputError(
+                f"{run}: is being reviewed by another `femoreg review`. Go on there, or end it."
+            ) from error
+        except OSError:  # no locks here
+            break
+        with suppress(FileNotFoundError):
+            if os.path.samestat(path.stat(), os.fstat(lock)):
+                break
+        os.close(lock)  # of one that ended just now and took its file away
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(lock)
 
 
 def landmarks_path(run: Path) -> Path:

@@ -17,6 +17,7 @@ _BONE_HU, _METAL_HU = 200.0, 2800.0
 _LEAST_HIP_ML = 15.0  # of a hip bone; whole ones of adults have 180 to 400
 _LEAST_FEMUR_ML = 10.0
 _LEAST_CONFIDENCE = 0.6  # mean probability of a bone; with less it is left out
+_LEAST_TOLD_ML = 0.5  # of what is left out; less are specks that nobody takes for a bone
 _DOUBTED = 0.85  # mean share of a bone below which a warning is given
 _CLOSED_MM2 = 150.0  # of contact between femur and hip bone; a head has some 5000 mm² in its socket
 _METAL_ML = 0.5
@@ -65,8 +66,10 @@ def segment_bones(ct: Volume, network: BoneNetwork, refine: bool = True) -> Segm
     left_out = []
     for name in doubtful:
         data[data == 1 + anatomy.bone_names.index(name)] = 0
-        told = f"{volume_ml.pop(name):.0f} ml, mean probability {confidence.pop(name):.2f}"
-        left_out.append(f"what may be {name} ({told}) was left out: the network is not sure")
+        left_ml, share = volume_ml.pop(name), confidence.pop(name)
+        if left_ml >= _LEAST_TOLD_ML:
+            told = f"{left_ml:.0f} ml, mean probability {share:.2f}"
+            left_out.append(f"what may be {name} ({told}) was left out: the network is not sure")
     labels = Volume(data, ct.lps_from_index)
     warnings = left_out + _warnings(ct, labels, network, volume_ml, confidence, hips)
     return Segmentation(labels, confidence, volume_ml, tuple(warnings))

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 _SUFFIXES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb")
 _MOST_UNZIPPED = 2**29  # bytes of all that a 3MF file holds
 _SHORTEST_MM, _LONGEST_MM = 5.0, 2000.0  # of a device; beyond them the file is likely in metres, inches or µm
+_FARTHEST_MM = 1e6  # of a corner from the origin
 
 
 def read_mesh(path: Path) -> "trimesh.Trimesh":
@@ -127,6 +128,8 @@ def _bodies(scene: "trimesh.Scene", path: Path) -> "dict[str, trimesh.Trimesh]":
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
         mesh.apply_transform(place)
         mesh.apply_scale(mm)
+        if (abs(mesh.vertices) > _FARTHEST_MM).any():
+            raise InputError(f"{path}: a corner lies {abs(mesh.vertices).max():.3g} mm from the origin. Is it in mm?")
         mesh.merge_vertices()
         a, b, c = mesh.faces.T
         mesh.update_faces((a != b) & (b != c) & (c != a))  # slivers whose corners became one in the file's float32

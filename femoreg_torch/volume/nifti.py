@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import nibabel
 
 _SAME_SIZE = 0.01  # voxels, of what rounding may make of them
-_SUFFIXES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz")
+NIFTI_SUFFIXES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz")
 
 
 def check_nifti(path: Path) -> None:
@@ -23,7 +23,7 @@ def check_nifti(path: Path) -> None:
 
     NIfTI-1 and NIfTI-2, in one file or two. Files of other names are passed.
     """
-    if not path.name.lower().endswith(_SUFFIXES):
+    if not path.name.lower().endswith(NIFTI_SUFFIXES):
         return
     import nibabel  # takes a tenth of a second, beside the reading of images
 

@@ -27,6 +27,7 @@ from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.volume.dicom import image_of, is_dicom, series_in
 from femoreg_torch.volume.itk import read_itk
+from femoreg_torch.volume.text_headers import NRRD_SUFFIXES, check_text_header
 
 SEGMENTATION_SUFFIX = ".seg.nrrd"
 _MASK_SUFFIXES = (".nii.gz", ".nii", ".nrrd", ".mha", ".mhd")
@@ -183,7 +184,14 @@ def _nifti_segments(path: Path) -> list[Segment]:
 
 
 def _slicer_segments(path: Path) -> list[Segment]:
+    unnamed = (
+        f"{path}: names no segments. In 3D Slicer, save the segmentation itself (.seg.nrrd), not a label map of it."
+    )
+    if not path.name.lower().endswith(NRRD_SUFFIXES):
+        raise InputError(unnamed)
+    check_text_header(path)
     reader = sitk.ImageFileReader()
+    reader.SetImageIO("NrrdImageIO")
     reader.SetFileName(str(path))
     try:
         with quiet():
@@ -193,9 +201,7 @@ def _slicer_segments(path: Path) -> list[Segment]:
         raise InputError(f"{path}: cannot be read; a segmentation of 3D Slicer (.seg.nrrd) was expected.") from error
     numbers = sorted(int(match[1]) for match in map(_NAME.fullmatch, fields) if match)
     if not numbers:
-        raise InputError(
-            f"{path}: names no segments. In 3D Slicer, save the segmentation itself (.seg.nrrd), not a label map of it."
-        )
+        raise InputError(unnamed)
     values = [_whole(fields, f"Segment{n}_LabelValue", 1, path) for n in numbers]
     layers = [_whole(fields, f"Segment{n}_Layer", 0, path, "0") for n in numbers]
     there = reader.GetNumberOfComponents()

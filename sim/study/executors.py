@@ -1,9 +1,11 @@
 """Where the batches of a study are done: in processes of this machine (joblib, loky), or on a cluster (Dask)."""
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 from joblib import delayed
 from joblib.externals.loky.process_executor import TerminatedWorkerError
@@ -14,6 +16,8 @@ from sim.study.processes import in_processes
 from sim.study.store import Batch, Store
 
 PATIENCE = "10s"  # with a scheduler that does not answer
+_NEEDED = ("dask", "distributed", "cloudpickle", "msgpack", "numpy")  # of those that Dask tells the versions of
+_OURS = ("femoreg_torch", "torch")
 
 
 @dataclass(frozen=True)
@@ -62,18 +66,23 @@ class OnCluster:
     def __call__(self, work: Work, store: Store, todo: Sequence[Batch], done: Callable[[Batch], None]) -> None:
         """A batch whose worker dies is given to another; one that ends several of them is given up.
 
-        Raises `InputError` if the scheduler does not answer or goes away, or its workers run several tasks at a time.
+        Raises `InputError` if the scheduler does not answer or goes away, if it or a worker has other packages, or if
+        its workers run several tasks at a time.
         """
         from distributed import Client, KilledWorker, as_completed
 
         try:
-            client = Client(self.address, timeout=PATIENCE, set_as_default=False)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of packages that differ, which is told below
+                client = Client(self.address, timeout=PATIENCE, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(
                 f"--scheduler {self.address}: does not answer ({' '.join(str(error).split())}). Give the address that "
                 "`dask scheduler` prints."
             ) from error
         with _quiet("distributed.client"), client:
+            versions: Any = client.get_versions(packages=_OURS)  # no coroutine, as the client is none of asyncio
+            _check_packages(versions, self.address)
             _check_workers(client.scheduler_info(n_workers=-1)["workers"], self.address)
             waiting = {client.submit(_perform, work, store, batch, pure=False): (batch, batch) for batch in todo}
             finished = as_completed(waiting, loop=client.loop)
@@ -107,6 +116,35 @@ def _quiet(name: str) -> Iterator[None]:
         yield
     finally:
         logger.setLevel(before)
+
+
+def _check_packages(versions: Mapping[str, Any], address: str) -> None:
+    """Raises `InputError` where scheduler or a worker has another Python or other packages than this process.
+
+    `versions` are those that `Client.get_versions` gives. What is sent could not be opened there, or would compute
+    otherwise.
+    """
+    here = versions["client"]["packages"]
+    places = {"the scheduler": versions["scheduler"]}
+    places |= {f"the worker {name}": told for name, told in versions["workers"].items()}
+    for place, told in places.items():
+        there = told["packages"]
+        differ = [
+            f"{name} {there.get(name) or '(none)'} in place of {here[name]}"
+            for name in ("python", *_NEEDED, *_OURS)
+            if _release(name, there) != _release(name, here)
+        ]
+        if differ:
+            raise InputError(
+                f"--scheduler {address}: {place} has other packages than this machine: {', '.join(differ)}. Install "
+                "the same ones there, by the same constraints.txt."
+            )
+
+
+def _release(name: str, packages: Mapping[str, str | None]) -> str | None:
+    """What has to be equal: of Python, major and minor version."""
+    found = packages.get(name)
+    return ".".join(found.split(".")[:2]) if name == "python" and found else found
 
 
 def _check_workers(workers: dict[str, dict[str, int]], address: str) -> None:

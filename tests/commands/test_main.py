@@ -127,6 +127,8 @@ def test_help_of_a_command_teaches(capsys: pytest.CaptureFixture[str]) -> None:
         (["measure", "a.png", "--out", "run", "--spacing-mm", "wide"], "wide"),
         (["measure", "a.png", "--out", "run", "--paint", "1"], "--paint"),
         (["measure", "a.png", "--out", "run", "--config", "no.yaml"], "no.yaml"),
+        (["measure", "a.png", "--out", ""], "an argument is empty"),
+        (["measure", "a.png", "--out="], "an argument is empty"),
     ],
 )
 def test_wrong_arguments_are_one_line(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -271,3 +273,34 @@ def test_the_installed_command_ends_with_its_status_after_all_that_was_registere
     assert ended.returncode == status
     assert ended.stdout.endswith("registered later\n")
     assert bool(ended.stderr) == (status == 2)
+
+
+@pytest.mark.parametrize(
+    ("redirected", "status", "lines"), [(">&-", 0, 0), ("<&- >&-", 0, 0), ("> /dev/full", 2, 1), ("| true", 0, 0)]
+)
+def test_streams_that_are_closed_or_full(redirected: str, status: int, lines: int) -> None:
+    done = subprocess.run(["bash", "-c", f"'{FEMOREG}' --version {redirected}"], capture_output=True, check=False)
+    assert done.returncode == status
+    assert done.stderr.count(b"\n") == lines
+    assert b"Traceback" not in done.stderr
+
+
+def test_without_stderr_the_status_tells(tmp_path: Path) -> None:
+    for redirected in ("2>&-", "2> /dev/full"):
+        command = ["bash", "-c", f"'{FEMOREG}' nosuch {redirected}"]
+        assert subprocess.run(command, capture_output=True, check=False).returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--seed", "1e308"], "--seed: a whole number was expected, found '1"),
+        (["--preset", "rough"], "--preset: one of 'paper', 'fast' was expected, found 'rough'"),
+        (["--spacing-mm", ".."], "--spacing-mm: a number was expected, found '"),
+    ],
+)
+def test_wrong_values_are_told_by_option_and_kind(
+    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["measure", "a.tif", "--out", "o", *arguments]) == 2
+    assert says in capsys.readouterr().err

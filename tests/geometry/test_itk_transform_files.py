@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 import SimpleITK as sitk
 import torch
@@ -49,3 +51,35 @@ def test_numbers_that_do_not_fit_never_reach_itk(tmp_path: Path, text: str, says
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=says):
         read_itk_transform(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("TransformParameters", np.zeros(5), "5 parameters"),
+        ("TransformParameters", (2**40,), "not the numbers"),
+        ("TransformFixedParameters", np.zeros(2), "2 fixed"),
+        ("TransformParameters", np.full(6, np.nan), "not all finite"),
+        ("TransformParameters", h5py.Empty("f"), "not the numbers"),
+        ("TransformType", h5py.Empty("f"), "cannot be read"),
+    ],
+)
+def test_hdf5_files_of_other_numbers(tmp_path: Path, name: str, value: object, says: str) -> None:
+    """A data set of 8 TiB takes a few bytes in a file."""
+    path = tmp_path / "pose.h5"
+    sitk.WriteTransform(KINDS["euler"], str(path))
+    with h5py.File(path, "a") as file:
+        group = file["TransformGroup/0"]
+        del group[name]
+        if isinstance(value, tuple):
+            group.create_dataset(name, value, "f8", chunks=True)
+        else:
+            group.create_dataset(name, data=value)
+    with pytest.raises(InputError, match=says):
+        read_itk_transform(path)
+
+
+def test_a_file_of_another_name_is_no_transform(tmp_path: Path) -> None:
+    (tmp_path / "pose.nii").write_bytes(bytes(400))
+    with pytest.raises(InputError, match=r"a name that ends in \.tfm"):
+        read_itk_transform(tmp_path / "pose.nii")

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import nibabel
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from intake_files import SIZE, bones, hu, label_values, landmarks, markups, ras_
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.uid import CTImageStorage, EnhancedCTImageStorage, ExplicitVRLittleEndian, RLELossless, generate_uid
 
+from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 from femoreg_torch.intake import inspect_path
 from femoreg_torch.volume import Volume, read_ct, read_ct_told, read_label_map, read_labels, read_landmarks
@@ -196,3 +198,20 @@ def test_markups_of_3d_slicer_with_numbers_for_the_space(tmp_path: Path, system:
     (tmp_path / "f.mrk.json").write_text(json.dumps(content | {"markups": [markup]}))
     with pytest.raises(InputError, match=r"does not say it\. Write `.coordinateSystem.: .LPS.`"):
         read_landmarks(tmp_path / "f.mrk.json")
+
+
+def test_a_picture_does_not_take_the_place_of_what_it_is_made_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = np.random.default_rng(0).integers(0, 4000, (20, 20), dtype=np.uint16)
+    (tmp_path / "case").mkdir()
+    (tmp_path / "case" / "case.yaml").write_text("views: [{anatomy: view1.png}]\n")
+    for path in (tmp_path / "a.png", tmp_path / "case" / "view1.png"):
+        cv2.imwrite(str(path), image)
+        before = path.read_bytes()
+        command = ["inspect", str(path)] if path.name == "a.png" else ["check", str(path.parent)]
+        assert main([*command, "--out", str(path)]) == 2
+        told = capsys.readouterr().err
+        assert "is what the picture is made of" in told
+        assert told.count("\n") == 1
+        assert path.read_bytes() == before

@@ -151,3 +151,10 @@ def test_an_unknown_preset_lists_the_known_ones() -> None:
 def test_a_preset_holds_steps_and_nothing_else() -> None:
     with pytest.raises(InputError, match="registration preset mine: unknown key 'stages'"):
         plan_from("mine", {"stages": []})
+
+
+@pytest.mark.parametrize("text", ["steps: []\n", "extends: fast\nsteps: []\n"])
+def test_a_preset_without_steps_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"mine\.yaml, steps: none is left"):
+        load_plan(tmp_path / "mine.yaml")

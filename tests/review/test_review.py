@@ -3,6 +3,8 @@
 import multiprocessing
 import re
 import socket
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +18,7 @@ from femoreg_torch.case.review import REVIEW_NAME, Review, read_review, result_s
 from femoreg_torch.commands.review import register_order
 from femoreg_torch.errors import InputError
 from femoreg_torch.registration import Scene
-from femoreg_torch.review import LOOPBACK, Desk, Order, review_app, serve
+from femoreg_torch.review import LOOPBACK, Desk, Order, only_review, review_app, serve
 
 TOKEN = "the-token"
 ACCEPT = {"decision": "accepted", "reviewer": "A. Surgeon", "note": "edges lie on the bone", "before": ""}
@@ -178,6 +180,31 @@ def test_a_file_that_is_no_review_is_one_line(run: Path, content: str, says: str
     (run / REVIEW_NAME).write_text(content)
     with pytest.raises(InputError, match=says):
         read_review(run)
+
+
+def test_two_reviews_of_one_run(tmp_path: Path) -> None:
+    """Of another process, by whatever name of the folder; the lock goes with that process."""
+    run = tmp_path / "deep" / "run"
+    code = f"""
+import sys, time
+from pathlib import Path
+from femoreg_torch.review import only_review
+with only_review(Path({str(run)!r})):
+    print("in", flush=True)
+    time.sleep(600)
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"in\n"
+        (tmp_path / "link").symlink_to(run.parent)
+        with pytest.raises(InputError, match="is being reviewed by another"), only_review(tmp_path / "link" / "run"):
+            pass
+        with only_review(tmp_path / "other"):
+            pass
+        other.kill()
+    with only_review(run):
+        pass
+    assert list(run.parent.iterdir()) == []
 
 
 def test_a_server_that_is_killed_leaves_what_was_there(desk: Desk, run: Path) -> None:

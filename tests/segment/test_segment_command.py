@@ -7,6 +7,7 @@ import nibabel
 import numpy as np
 import pytest
 import SimpleITK as sitk
+from fuzz_faults import full_after
 from hip_scenes import FEMUR_LEFT, HEAD, RADIUS_MM, answering, dice, hip_scene, shares_of
 
 from femoreg_torch.commands.main import main
@@ -40,6 +41,22 @@ def test_the_label_map_lies_on_the_voxels_of_the_file(ct_in_ras: Path, tmp_path:
     assert told["table"] == "femoreg"
     assert set(told["confidence"]) == {"hip_left", "femur_left"}
     assert (tmp_path / "labels.png").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("size", [100, 2000])
+def test_on_a_full_disk_the_older_files_stay(
+    size: int, ct_in_ras: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("labels.nii.gz", "labels.json", "labels.png"):
+        (tmp_path / name).write_text("old")
+    there = sorted(tmp_path.iterdir())
+    with full_after(size):
+        assert main(["segment", str(ct_in_ras), "--out", str(tmp_path / "labels.nii.gz")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert ".part" not in error
+    assert sorted(tmp_path.iterdir()) == there
+    assert {(tmp_path / f"labels.{suffix}").read_text() for suffix in ("nii.gz", "json", "png")} == {"old"}
 
 
 def test_the_head_is_proposed_and_what_is_not_there_left_out(

@@ -1,6 +1,7 @@
 """Runs that cannot go on as they are told to: checkpoints cut off or of another network, no GPU, odd overrides."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -119,3 +120,13 @@ def test_odd_overrides_are_one_line(override: str) -> None:
         settings(override)
     assert "\n" not in str(raised.value)
     assert len(str(raised.value)) < 1500
+
+
+def test_a_checkpoint_of_another_pickle_protocol_prints_nothing(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    """torch warns of it, and then refuses what it cannot read."""
+    torch.save({"state_dict": {}, "global_step": 5}, tmp_path / "a.ckpt", pickle_protocol=4)
+    with suppress(InputError):
+        read_checkpoint(tmp_path / "a.ckpt")
+    assert len(recwarn) == 0

@@ -118,6 +118,10 @@ def test_a_run_is_resumed_and_its_weights_are_read(tmp_path: Path) -> None:
     assert "step 3" in told[-1]
     assert len((out / "progress.csv").read_text().splitlines()) == 4
     assert load_bone_network(weights).multiple == 4
+    checkpoint = out / "checkpoint.pt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"checkpoint\.pt: is cut off"):
+        train_segmentation(replace(settings, steps=4), paths, out, tmp_path, True, told.append)
 
 
 def test_the_shipped_settings_can_be_read() -> None:

@@ -157,5 +157,5 @@ def test_files_that_are_missing_or_something_else(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         segment_names(tmp_path / "none.seg.nrrd")
     (tmp_path / "text.seg.nrrd").write_text("not an image")
-    with pytest.raises(InputError, match="cannot be read; a segmentation of 3D Slicer"):
+    with pytest.raises(InputError, match="no NRRD file"):
         segment_names(tmp_path / "text.seg.nrrd")

@@ -17,6 +17,7 @@ from torch.nn import functional as F
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from femoreg_torch.anatomy import HIP
+from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file, write_json
 from femoreg_torch.segment.network import network_input, padded_to
@@ -84,6 +85,22 @@ def read_segmentation_settings(name: str) -> SegmentationSettings:
     return read_record(SegmentationSettings, load_preset("segmentation", name), f"training settings {name}")
 
 
+def resumed(path: Path, network: nn.Module, average: nn.Module, optimiser: torch.optim.Optimizer) -> tuple[int, float]:
+    """Take over the state of an earlier run; how many steps it had done, in how many seconds. Raises `InputError`."""
+    try:
+        with quiet():
+            state = torch.load(path, weights_only=True)
+        network.load_state_dict(state["network"])
+        average.load_state_dict(state["average"])
+        optimiser.load_state_dict(state["optimiser"])
+        return int(state["step"]), float(state["seconds"])
+    except Exception as error:  # of zip, pickle or torch, by where the file is damaged
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(
+            f"{path}: is cut off, damaged, or of another network ({reason}). Train anew into another folder."
+        ) from error
+
+
 def train_segmentation(
     settings: SegmentationSettings,
     shapes: list[Path],
@@ -118,11 +135,7 @@ def train_segmentation(
     optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=1e-3)
     first, seconds = 0, 0.0
     if resume:
-        state = torch.load(checkpoint, weights_only=True)
-        network.load_state_dict(state["network"])
-        average.load_state_dict(state["average"])
-        optimiser.load_state_dict(state["optimiser"])
-        first, seconds = state["step"], state["seconds"]
+        first, seconds = resumed(checkpoint, network, average, optimiser)
     validation = _validation_scans(held_out, settings)
     draw = random.Random(settings.seed * 10**6 + first)
     waiting: list[Scan] = []

@@ -15,7 +15,7 @@ from joblib import delayed
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json
-from sim.study.executors import OnCluster, OnThisMachine
+from sim.study.executors import OnCluster, OnThisMachine, _check_packages
 from sim.study.processes import in_processes
 from sim.study.rows import TABLE_NAME, comparable, read_table
 from sim.study.study import run_study
@@ -58,6 +58,24 @@ def test_a_cluster_that_is_not_there_is_told(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr("sim.study.executors.PATIENCE", "1s")
     with pytest.raises(InputError, match=r"--scheduler tcp://127.0.0.1:9: does not answer"):
         run_study(study(1, Cheap()), tmp_path, OnCluster("tcp://127.0.0.1:9"))
+
+
+def with_packages(**changed: str | None) -> dict[str, dict[str, str | None]]:
+    names = ("dask", "distributed", "cloudpickle", "msgpack", "numpy", "femoreg_torch", "torch")
+    return {"packages": {"python": "3.11.7.final.0", **dict.fromkeys(names, "1"), **changed}}
+
+
+def test_a_cluster_with_other_packages_is_told() -> None:
+    same = {"client": with_packages(), "scheduler": with_packages(), "workers": {"tcp://a": with_packages()}}
+    _check_packages(same, "tcp://s")
+    _check_packages({**same, "scheduler": with_packages(python="3.11.2.final.0", toolz="9")}, "tcp://s")
+    says = r"--scheduler tcp://s: the scheduler has other packages .*: python 3\.12\.0\.final\.0 in .*, numpy 2 in"
+    with pytest.raises(InputError, match=says):
+        _check_packages({**same, "scheduler": with_packages(python="3.12.0.final.0", numpy="2")}, "tcp://s")
+    with pytest.raises(
+        InputError, match=r"the worker tcp://a has other packages .*: femoreg_torch \(none\) in place of 1"
+    ):
+        _check_packages({**same, "workers": {"tcp://a": with_packages(femoreg_torch=None)}}, "tcp://s")
 
 
 @pytest.mark.long
