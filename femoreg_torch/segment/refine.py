@@ -35,6 +35,7 @@ _CLOSE_MM = 2.0  # gaps so wide within a bone are marrow, where the network agre
 _CLOSED_SHARE = 0.4
 _SURE_MM = 3.0  # a voxel so far from the other bone is surely of its own
 _VALLEY_MM = 0.7  # standard deviation of the blur that takes the noise off the joint space
+_BRIDGE_HU = 250.0  # between two bones; cartilage and fluid are far below
 _LINE_MM = 1.5  # the largest voxels of a line that parts two bones
 _LEAST_PART, _LEAST_PART_ML = 0.1, 1.0  # of the largest part of a bone; smaller ones are dropped
 
@@ -240,6 +241,28 @@ def opened_joints(
             valley = hu[box] < ndimage.uniform_filter(hu[box], 3)
             part[contact(part, femur, hip) & valley] = 0
     return result
+
+
+def closed_joint_mm2(
+    labels: NDArray[np.uint8], hu: NDArray[np.float32], femur: int, hip: int, spacing: NDArray[np.float64]
+) -> float:
+    """Area over which femur and hip bone touch, or are parted by voxels as bright as bone, so that no gap is seen."""
+    one_box, other_box = (ndimage.find_objects(labels == number, 1)[0] for number in (femur, hip))
+    if one_box is None or other_box is None:
+        return 0.0
+    box = tuple(
+        slice(max(0, max(one.start, other.start) - 2), min(one.stop, other.stop) + 2)
+        for one, other in zip(one_box, other_box, strict=True)
+    )
+    part, bright = labels[box], hu[box] > _BRIDGE_HU
+    if not part.size:
+        return 0.0
+    x, y, z = spacing
+    face_mm2 = float(np.mean([x * y, x * z, y * z]))
+    reach = 1 if spacing.min() > 0.9 * _FINEST_MM else 2  # a line of `_FINEST_MM` is at most so many voxels wide
+    beside = [ndimage.binary_dilation(part == number, iterations=reach) for number in (femur, hip)]
+    bridged = (part == 0) & bright & beside[0] & beside[1]
+    return face_mm2 * (float(contact(part, femur, hip).sum()) / 2 + float(bridged.sum()) / reach)
 
 
 def contact(labels: NDArray[np.uint8], one: int, other: int) -> Mask:
