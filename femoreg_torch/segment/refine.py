@@ -237,9 +237,8 @@ def opened_joints(
         smooth = ndimage.gaussian_filter(hu[box], _VALLEY_MM / spacing[::-1])
         apart = watershed(-smooth, markers, mask=both, watershed_line=fine)
         part[both] = apart[both]
-        if not fine:
-            valley = hu[box] < ndimage.uniform_filter(hu[box], 3)
-            part[contact(part, femur, hip) & valley] = 0
+        dark = fine | (hu[box] < ndimage.uniform_filter(hu[box], 3))
+        part[contact(part, femur, hip) & dark] = 0
     return result
 
 
