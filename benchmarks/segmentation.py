@@ -6,7 +6,7 @@ Around each label map (ids of the table `autoseg`) a CT of 1 mm is computed by `
 and noise are not those of the training's random CTs; the maps have no spine, so these CTs have none. Femora that a map
 cuts go on downwards as they end. Folders of synthetic patients (ct.nii.gz, labels.nii.gz, landmarks.json) are read as
 they are. Ways: `network` its outlines alone, `refined` what `femoreg segment` gives, `true` the refinement of the true
-labels averaged to the network's voxels, and `sheetness` without a network.
+labels averaged to the network's voxels.
 """
 
 import argparse
@@ -19,7 +19,6 @@ import torch
 from measure import machine, table, write_section
 from numpy.typing import NDArray
 from scipy import ndimage
-from sheetness import sheetness_labels
 from torch.nn import functional as F
 
 from femoreg_torch.anatomy import HIP, label_table
@@ -52,7 +51,7 @@ def main() -> None:
     parser.add_argument("cases", type=Path, nargs="+", help="label maps, or folders of synthetic patients")
     parser.add_argument("--weights", type=Path, help="by default the shipped ones")
     parser.add_argument("--cache", type=Path, required=True, help="where CTs around label maps are kept")
-    parser.add_argument("--ways", nargs="+", default=["refined", "network", "true", "sheetness"])
+    parser.add_argument("--ways", nargs="+", default=["refined", "network", "true"])
     parser.add_argument("--title", default="Bones of whole CTs around held-out shapes")
     options = parser.parse_args()
     network = load_bone_network(options.weights)
@@ -60,7 +59,6 @@ def main() -> None:
         "refined": lambda ct, _: segment_bones(ct, network).labels.data.numpy(),
         "network": lambda ct, _: segment_bones(ct, network, refine=False).labels.data.numpy(),
         "true": lambda ct, truth: _from_truth(ct, truth, network),
-        "sheetness": lambda ct, _: sheetness_labels(ct),
     }
     rows = []
     for path in options.cases:
