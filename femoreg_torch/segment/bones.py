@@ -9,7 +9,7 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.segment.network import BoneNetwork, bone_shares
-from femoreg_torch.segment.refine import contact, refined_labels, unrefined_labels
+from femoreg_torch.segment.refine import closed_joint_mm2, refined_labels, unrefined_labels
 from femoreg_torch.volume import Volume
 from femoreg_torch.volume.borders import cut_bones
 
@@ -19,7 +19,7 @@ _LEAST_FEMUR_ML = 10.0
 _LEAST_CONFIDENCE = 0.6  # mean probability of a bone; with less it is left out
 _LEAST_TOLD_ML = 0.5  # of what is left out; less are specks that nobody takes for a bone
 _DOUBTED = 0.85  # mean share of a bone below which a warning is given
-_CLOSED_MM2 = 150.0  # of contact between femur and hip bone; a head has some 5000 mm² in its socket
+_CLOSED_MM2 = 150.0  # of femur and hip bone without a gap; a head has some 5000 mm² in its socket
 _METAL_ML = 0.5
 _MAIN_PART = 0.3  # of the largest part of the hip bones; smaller ones may be stray specks
 _SIDE_SHARE = {"femur": 0.6, "hip": 0.97}  # a part with so much of one side is all of it; hip bones may meet
@@ -143,15 +143,13 @@ def _warnings(
     metal = float((ct.data > _METAL_HU).sum()) * float(np.prod(ct.spacing_mm)) / 1000
     if metal > _METAL_ML:
         told.append(f"{metal:.1f} ml of metal: look at the bones around it")
-    z, y, x = (ct.spacing_mm[k] for k in (2, 1, 0))
-    face_mm2 = float(np.mean([y * x, z * x, z * y]))
-    data = labels.data.numpy()
+    data, hu, spacing = labels.data.numpy(), ct.data.numpy(), np.array(ct.spacing_mm)
     for side in ("left", "right"):
         femur, hip = f"femur_{side}", f"hip_{side}"
         if {femur, hip} <= set(ids):
-            closed = contact(data, ids[femur], ids[hip]).sum() / 2 * face_mm2
+            closed = closed_joint_mm2(data, hu, ids[femur], ids[hip], spacing)
             if closed > _CLOSED_MM2:
-                told.append(f"{femur} and {hip} touch over {closed:.0f} mm²: the joint space is not open")
+                told.append(f"{femur} and {hip}: no joint space is to be seen over {closed:.0f} mm²")
     told += [
         f"{name}: the network is not sure (mean probability {share:.2f})"
         for name, share in confidence.items()

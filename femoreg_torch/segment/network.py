@@ -15,6 +15,7 @@ from femoreg_torch.volume import Volume, resample_isotropic
 _LOWEST_HU, _HIGHEST_HU, _UNIT_HU = -300.0, 1300.0, 400.0  # what the network sees
 _LARGEST = 192  # voxels along z that are read at once; a longer CT is read in overlapping parts
 _OVERLAP = 48  # voxels that neighbouring parts share; half of them count for each
+SHIFTS = ((0, 0, 0), (5, 3, 7), (3, 7, 5), (9, 10, 4))  # voxels along z, y, x, so that its blocks fall elsewhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +74,8 @@ def padded_to(values: Tensor, multiple: int) -> Tensor:
 def bone_shares(network: BoneNetwork, ct: Volume) -> tuple[Tensor, Volume]:
     """Probabilities (classes, Z, Y, X) of background and bones, and the CT on the network's voxels.
 
-    The mean of the CT as it is and of its mirror image, sides exchanged. The axes of `ct` run along +L, +P, +S, or
-    nearly so. Raises `InputError` for a CT that is smaller than a voxel of the network.
+    The mean over the CT as it is and its mirror image, sides exchanged, each moved by `SHIFTS`. The axes of `ct` run
+    along +L, +P, +S, or nearly so. Raises `InputError` for a CT that is smaller than a voxel of the network.
     """
     grid = resample_isotropic(ct, network.voxel_mm)
     exchanged = list(network.anatomy.mirrored_classes)
@@ -82,7 +83,10 @@ def bone_shares(network: BoneNetwork, ct: Volume) -> tuple[Tensor, Volume]:
     total = torch.zeros((1 + len(network.anatomy.bones), *grid.data.shape))
     for start in starts:
         part = grid.data[start : start + _LARGEST]
-        read = (_shares(network, part) + _shares(network, part.flip(2)).flip(3)[exchanged]) / 2
+        read = torch.zeros((len(total), *part.shape))
+        for shift in SHIFTS:
+            read += _shares(network, part, shift) + _shares(network, part.flip(2), shift).flip(3)[exchanged]
+        read /= 2 * len(SHIFTS)
         first = 0 if start == 0 else _OVERLAP // 2
         last = part.shape[0] if start + _LARGEST >= grid.data.shape[0] else part.shape[0] - _OVERLAP // 2
         total[:, start + first : start + last] = read[:, first:last]
@@ -93,8 +97,10 @@ def _starts(length: int) -> list[int]:
     return [0, *range(_LARGEST - _OVERLAP, max(0, length - _OVERLAP), _LARGEST - _OVERLAP)]
 
 
-def _shares(network: BoneNetwork, hu: Tensor) -> Tensor:
-    z, y, x = hu.shape
-    logits = network.module(padded_to(network_input(hu), network.multiple)[None, None])
-    result: Tensor = logits[0, :, :z, :y, :x].softmax(0)
+def _shares(network: BoneNetwork, hu: Tensor, shift: tuple[int, int, int]) -> Tensor:
+    z, y, x = shift
+    moved = F.pad(network_input(hu), (x, 0, y, 0, z, 0), value=_LOWEST_HU / _UNIT_HU)
+    logits = network.module(padded_to(moved, network.multiple)[None, None])
+    depth, height, width = hu.shape
+    result: Tensor = logits[0, :, z : z + depth, y : y + height, x : x + width].softmax(0)
     return result

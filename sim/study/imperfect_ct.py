@@ -1,4 +1,7 @@
-"""A case's CT made worse than the patient that was imaged: thick slices, another kernel, wrong HU, a poor label map."""
+"""A case's CT made worse than the patient that was imaged: thick slices, another kernel, wrong HU, a poor label map.
+
+Or its labels and landmarks are those that `femoreg segment` and `femoreg landmarks` find in it.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,9 +11,11 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from femoreg_torch.anatomy import HIP, label_table
 from femoreg_torch.geometry import transform_points
+from femoreg_torch.segment import load_bone_network, propose_landmarks, segment_bones
 from femoreg_torch.settings import check_within
-from femoreg_torch.volume import Volume, crop, read_ct, read_labels, write_volume
+from femoreg_torch.volume import Volume, bone_labels, crop, read_ct, read_labels, write_landmarks, write_volume
 
 
 @dataclass(frozen=True)
@@ -22,6 +27,8 @@ class ImperfectCt:
     hu_scale: float = 1.0
     grow_voxels: int = 0  # of every bone's labels, into what has none; negative: they shrink
     cut_mm: float | None = None  # the scan ends so far below the head of the operated femur
+    found_labels: bool = False  # the label map is the one that is found in the CT
+    found_landmarks: bool = False  # and so are the landmarks
 
     def __post_init__(self) -> None:
         check_within(
@@ -30,7 +37,10 @@ class ImperfectCt:
 
 
 def spoil_ct(folder: Path, head: Tensor, change: ImperfectCt) -> None:
-    """Change the CT and the label map in a case folder; `head` (3,) is the centre of the femoral head, LPS mm."""
+    """Change CT, label map and landmarks in a case folder; `head` (3,) is the centre of the femoral head, LPS mm.
+
+    Raises `InputError` if bones or landmarks are to be found and the CT shows none.
+    """
     ct_path, labels_path = folder / "ct.nii.gz", folder / "labels.nii.gz"
     ct = read_ct(ct_path)
     labels = read_labels(labels_path, ct)
@@ -42,7 +52,13 @@ def spoil_ct(folder: Path, head: Tensor, change: ImperfectCt) -> None:
     labels = labels.with_data(torch.from_numpy(grown(labels.data.numpy(), change.grow_voxels)))
     if change.slice_mm is not None:
         ct, labels = thick_slices(ct, change.slice_mm, mean=True), thick_slices(labels, change.slice_mm, mean=False)
-    write_volume(ct_path, ct.with_data(ct.data.round().to(torch.int16)))
+    ct = ct.with_data(ct.data.round())
+    if change.found_labels:
+        labels = segment_bones(ct, load_bone_network()).labels
+    if change.found_landmarks:
+        bones = bone_labels(labels, ct, label_table("femoreg"), HIP, {})
+        write_landmarks(folder / "landmarks.json", propose_landmarks(ct, bones).points)
+    write_volume(ct_path, ct.with_data(ct.data.to(torch.int16)))
     write_volume(labels_path, labels)
 
 

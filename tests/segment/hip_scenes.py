@@ -8,6 +8,7 @@ from torch.nn import functional as F
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.segment import BoneNetwork
+from femoreg_torch.segment.network import SHIFTS
 from femoreg_torch.volume import Volume, axis_aligned
 
 HIP_LEFT, FEMUR_LEFT = 1 + HIP.bone_names.index("hip_left"), 1 + HIP.bone_names.index("femur_left")
@@ -52,19 +53,20 @@ def shares_of(labels: NDArray[np.uint8], spacing: tuple[float, float, float], vo
 
 
 class Answer(nn.Module):
-    """A network that gives the same shares whatever it reads, and those of the mirror image every second time."""
+    """A network that gives the same shares whatever it reads: moved as that is, and mirrored every second time."""
 
     def __init__(self, shares: Tensor) -> None:
         super().__init__()
-        self.shares, self.mirrored = shares, False
+        self.shares, self.calls = shares, 0
 
     def forward(self, volume: Tensor) -> Tensor:
-        shares = self.shares.flip(3)[list(HIP.mirrored_classes)] if self.mirrored else self.shares
-        self.mirrored = not self.mirrored
+        shares = self.shares.flip(3)[list(HIP.mirrored_classes)] if self.calls % 2 else self.shares
+        low = SHIFTS[self.calls // 2 % len(SHIFTS)]
+        self.calls += 1
         result = torch.full((1, len(shares), *volume.shape[2:]), -20.0)
         result[0, 0] = 20.0
-        z, y, x = shares.shape[1:]
-        result[0, :, :z, :y, :x] = shares.clamp(min=1e-6).log()
+        z, y, x = (slice(a, a + n) for a, n in zip(low, shares.shape[1:], strict=True))
+        result[0, :, z, y, x] = shares.clamp(min=1e-6).log()
         return result
 
 
