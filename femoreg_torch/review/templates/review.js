@@ -166,9 +166,9 @@
 
   // Objects: motions gather while the server draws the last one
 
+  let moved = Promise.resolve(); // once the server knows all motions
   const nothing = () => ({ shift_px: [0, 0], turn_deg: 0, tilt_deg: [0, 0], depth_mm: 0 });
   const sendMoves = async () => {
-    if (busy) return;
     busy = true;
     while (waiting) {
       const move = waiting;
@@ -187,7 +187,7 @@
     waiting.turn_deg += part.turn_deg || 0;
     waiting.depth_mm += part.depth_mm || 0;
     hint();
-    sendMoves();
+    if (!busy) moved = sendMoves();
   };
   // Until the server has drawn it, the picture of the edges itself is moved.
   const hint = () => {
@@ -290,8 +290,8 @@
     else if (button.dataset.move) move(active, JSON.parse(button.dataset.move));
     else if (button.dataset.do) {
       say(button.dataset.do === "find" ? "Looking for landmarks …" : "");
-      post("change", { do: button.dataset.do });
-    } else if (button.dataset.start) post("start", { source: button.dataset.start });
+      moved.then(() => post("change", { do: button.dataset.do }));
+    } else if (button.dataset.start) moved.then(() => post("start", { source: button.dataset.start }));
     else if (button.id === "cancel") post("cancel", {});
     else if (button.id === "remove") post("change", { unmark: chosen });
     else if (button.classList.contains("enlarge")) {
