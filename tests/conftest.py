@@ -1,7 +1,10 @@
-"""What all tests share: where the real anatomy is, if it is there at all."""
+"""What all tests share: where the real anatomy is, if it is there at all, and what schemas say of files."""
 
+import json
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numba
 import pytest
@@ -22,3 +25,16 @@ def data_folder() -> Path:
     if not folder.is_dir():
         pytest.skip("no real anatomy here: set FEMOREG_DATA to its folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def against_schema() -> Callable[[str, Any], list[str]]:
+    """A function: what is wrong with the content of a file by `docs/reference/<name>.schema.json`, in words."""
+    jsonschema = pytest.importorskip("jsonschema")
+    folder = Path(__file__).resolve().parents[1] / "docs" / "reference"
+
+    def problems(name: str, content: Any) -> list[str]:
+        schema = json.loads((folder / f"{name}.schema.json").read_text(encoding="utf-8"))
+        return [error.message for error in jsonschema.Draft202012Validator(schema).iter_errors(content)]
+
+    return problems

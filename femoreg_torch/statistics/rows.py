@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from pandas.api.types import is_scalar
+from pandas.api.types import is_object_dtype, is_scalar
 
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import temporary_file
@@ -73,7 +73,7 @@ def checked_rows(rows: pd.DataFrame, where: str | Path) -> pd.DataFrame:
     if not (numbers % 1 == 0).all():
         raise InputError(f"{where}, column number: whole numbers were expected, one for each procedure.")
     rows = rows.copy()
-    for column in rows.select_dtypes(object):
+    for column in [c for c in rows if is_object_dtype(rows[c])]:  # columns of text hold nothing else
         rows[column] = rows[column].map(lambda value: value if is_scalar(value) else _text(value))
     for column in [c for c in (*IDENTITY, *OUTCOME, ASKED) if c in rows and c not in _NOT_TEXT]:
         rows[column] = rows[column].astype(object).where(rows[column].notna(), "").map(_text)

@@ -65,6 +65,7 @@ def section(rows: pd.DataFrame, total: int, preset: str, timing: Timing | None) 
         versions_told(rows),
         _errors(rows, preset),
         f"![Share of runs with an error of at most so much](accuracy_{preset}.png)",
+        "Share of runs with an error of at most so much, a line per kind of patient. Dashed: the paper's mean.",
         "### Trust",
         _trust(rows),
         *_doubtful(rows),

@@ -138,8 +138,11 @@ def success_rates(rows: pd.DataFrame) -> dict[str, list[tuple[float, int, int]]]
     return rates
 
 
-def write_capture(rows: pd.DataFrame, plan: Plan, out: Path, docs: Path | None) -> str:
-    """Write the figure into `out`, and a section with it into `docs`, if given. Returns the section."""
+def write_capture(rows: pd.DataFrame, plan: Plan, command: str, out: Path, docs: Path | None) -> str:
+    """Write the figure into `out`, and a section with it into `docs`, if given. Returns the section.
+
+    `command` is what made the rows.
+    """
     rates = success_rates(rows)
     names = ", ".join(f"“{step.name}”" for step in first_stages(plan).steps)
     title = f"Capture range of the pelvis in view 1, {plan.preset}"
@@ -150,7 +153,7 @@ def write_capture(rows: pd.DataFrame, plan: Plan, out: Path, docs: Path | None) 
     ]
     text = "\n\n".join(
         [
-            f"`make capture-range PRESET={plan.preset}`: the stages of the first view ({names}) from starts off the "
+            f"`{command}`: the stages of the first view ({names}) from starts off the "
             f"truth, on {rows['number'].nunique()} simulated procedures. Success: the middle of the pelvis within "
             f"{SUCCESS_MM:g} mm and its rotation within {SUCCESS_DEG:g}° afterwards; the femur starts as the CT has "
             "it. Shaded: 95 % interval.",

@@ -19,6 +19,7 @@ def capture_range(
     patients: Path | None = None,
     data: Path = DATA,
     jobs: int = 1,
+    reuse: bool = False,
     docs: Path | None = None,
 ) -> int:
     """Success of the pelvis stages in view 1 against the offset of the start; kept in OUT/capture_PRESET.
@@ -32,6 +33,7 @@ def capture_range(
         patients: CTs around real bone shapes; OUT/patients if not given.
         data: folder with meshes/SUBJECT.npz of the real bones; the environment's FEMOREG_DATA, if set.
         jobs: procedures at the same time, on one core each.
+        reuse: take results that are there although code or plan have changed since (those of the same code always are).
         docs: folder of the page that is to be renewed.
     """
     chosen = chosen_of("accuracy", preset, first, kind, out, patients, data)
@@ -39,8 +41,9 @@ def capture_range(
     folder = out / f"capture_{preset}"
     (setting,) = chosen.settings.values()
     study = plan_capture(setting, chosen.procedures, chosen.stores, chosen.imaged, starts)
-    status = carry_out_told(study, folder, OnThisMachine(jobs), reuse=False)
-    print(write_capture(read_study(folder), setting.plan, folder, docs))
+    status = carry_out_told(study, folder, OnThisMachine(jobs), reuse)
+    command = f"python -m sim.study capture-range --preset {preset} --first {first} --starts {starts}"
+    print(write_capture(read_study(folder), setting.plan, command, folder, docs))
     return status
 
 

@@ -1,9 +1,12 @@
 """`beads.yaml` and tables of shadows: what is read, and what is told of bad ones."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+import yaml
 from bead_scenes import DEVICE, FEMUR
 
 from femoreg_torch.beads import read_beads
@@ -37,7 +40,8 @@ BOTH = """objects:
 TWICE = "objects:\n  femur: &f {points: femur.mrk.json, diameter_mm: 1}\n  device: *f\n"
 
 
-def test_points_of_slicer_and_of_the_plain_format(case: Case) -> None:
+def test_points_of_slicer_and_of_the_plain_format(case: Case, against_schema: Callable[[str, Any], list[str]]) -> None:
+    assert not against_schema("beads", yaml.safe_load(BOTH + "image_noise_px: 0.7\nviews: first\n"))
     given = read_beads(written(case, BOTH + "image_noise_px: 0.7\nviews: first\n"), case)
     femur, device = given.beads
     torch.testing.assert_close(femur.points, FEMUR)

@@ -1,7 +1,9 @@
 """From a case with beads in CT and images to its truth, a case without beads, and Table III."""
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,8 +112,12 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_beads_give_the_truth_and_are_taken_out(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    against_schema: Callable[[str, Any], list[str]],
 ) -> None:
+    assert not against_schema("beads", yaml.safe_load((folder / "beads.yaml").read_text(encoding="utf-8")))
     out = tmp_path / "trials" / "I"
     assert main(["beads", str(folder), "--beads", str(folder / "beads.yaml"), "--out", str(out)]) == 0
     case = read_case(out)
@@ -123,6 +129,7 @@ def test_beads_give_the_truth_and_are_taken_out(
         assert angle < 0.3
         assert shifted < 0.6
     told = read_json(out / "truth_uncertainty.json")
+    assert not against_schema("truth_uncertainty", told)
     assert told["shadows"]["used"] >= 25  # of 5 in four images and 5 in two
     assert 0.02 <= told["image_noise_px"] < 0.2
     assert told["deviations"]["femur"]["mm"] < 0.8

@@ -1,7 +1,9 @@
 """The schemas of files fit what is read and written, and nothing besides."""
 
+import dataclasses
 import json
-from typing import Any
+from collections.abc import Callable
+from typing import Any, get_type_hints
 
 import pytest
 import torch
@@ -16,20 +18,18 @@ from femoreg_torch.case.reading import _KEYS
 from femoreg_torch.case.result_file import result_content
 from femoreg_torch.files import plain
 from femoreg_torch.geometry import Poses
+from femoreg_torch.planning.path import Clearances
+from femoreg_torch.planning.settings import Planning
 from femoreg_torch.text import yaml_content
 
 jsonschema = pytest.importorskip("jsonschema")
+Problems = Callable[[str, Any], list[str]]
 MATRIX = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 
 def schema(name: str) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((ROOT / f"docs/reference/{name}.schema.json").read_text(encoding="utf-8"))
     return found
-
-
-def problems(name: str, content: Any) -> list[str]:
-    checker = jsonschema.Draft202012Validator(schema(name))
-    return [error.message for error in checker.iter_errors(content)]
 
 
 def shown_cases() -> list[dict[str, Any]]:
@@ -40,26 +40,26 @@ def shown_cases() -> list[dict[str, Any]]:
     return found
 
 
-@pytest.mark.parametrize("name", ["case", "truth", "result"])
+@pytest.mark.parametrize("name", ["case", "truth", "result", "navigation", "plan", "beads", "truth_uncertainty"])
 def test_a_schema_is_one(name: str) -> None:
     jsonschema.Draft202012Validator.check_schema(schema(name))
 
 
-def test_the_cases_on_the_page_fit() -> None:
+def test_the_cases_on_the_page_fit(against_schema: Problems) -> None:
     cases = shown_cases()
     assert len(cases) == 2
     for case in cases:
-        assert not problems("case", case)
-        assert problems("case", case | {"unknown": 1})
-        assert problems("case", case | {"version": 3})
+        assert not against_schema("case", case)
+        assert against_schema("case", case | {"unknown": 1})
+        assert against_schema("case", case | {"version": 3})
 
 
-def test_a_case_of_version_1_fits() -> None:
+def test_a_case_of_version_1_fits(against_schema: Problems) -> None:
     case = shown_cases()[0]
     del case["template"]
     ct = {"image": "ct.nii.gz", "labels": "l.nii.gz", "structures": {"pelvis": [1, 2], "femur_left": [5]}}
-    assert not problems("case", case | {"version": 1, "ct": ct})
-    assert problems("case", case | {"version": 1, "ct": ct | {"bones": "femoreg"}})
+    assert not against_schema("case", case | {"version": 1, "ct": ct})
+    assert against_schema("case", case | {"version": 1, "ct": ct | {"bones": "femoreg"}})
 
 
 def test_the_keys_of_a_case_are_those_that_are_read() -> None:
@@ -76,7 +76,7 @@ def test_the_keys_of_a_case_are_those_that_are_read() -> None:
     }  # fmt: skip
 
 
-def test_a_result_fits() -> None:
+def test_a_result_fits(against_schema: Problems) -> None:
     eye = torch.eye(4, dtype=torch.float64)
     quality = ObjectQuality(
         views=(),
@@ -90,12 +90,32 @@ def test_a_result_fits() -> None:
     )
     result = Result(Poses(eye[None], {"pelvis": eye, "femur": eye}), {"pelvis": quality, "femur": quality})
     content = json.loads(json.dumps(plain(result_content(result))))
-    assert not problems("result", content)
-    assert problems("result", content | {"trusted": "yes"})
-    assert problems("result", content | {"camera1_from_femur": [[1.0]]})
+    assert not against_schema("result", content)
+    assert against_schema("result", content | {"trusted": "yes"})
+    assert against_schema("result", content | {"camera1_from_femur": [[1.0]]})
 
 
-def test_a_truth_fits() -> None:
+def test_a_truth_fits(against_schema: Problems) -> None:
     truth = {"camera_from_pelvis": [MATRIX], "camera1_from_femur": MATRIX}
-    assert not problems("truth", truth)
-    assert problems("truth", truth | {"camera1_from_femur": MATRIX[:3]})
+    assert not against_schema("truth", truth)
+    assert against_schema("truth", truth | {"camera1_from_femur": MATRIX[:3]})
+
+
+def test_the_keys_of_a_plan_are_those_of_its_records() -> None:
+    """Written plans are held against the schema in the planner's own tests."""
+    found = schema("plan")
+    assert set(found["properties"]["clearances"]["properties"]) == {f.name for f in dataclasses.fields(Clearances)}
+    settings = found["$defs"]["settings"]["properties"]
+    for section, record in get_type_hints(Planning).items():
+        assert set(settings.pop(section)["properties"]) == {field.name for field in dataclasses.fields(record)}
+    assert not settings
+
+
+def test_the_beads_on_the_page_fit(against_schema: Problems) -> None:
+    (shown,) = (block.code for block in blocks_of("docs/beads.md") if block.code.startswith("objects:"))
+    content = yaml_content(shown, "page")
+    assert not against_schema("beads", content)
+    assert against_schema("beads", content | {"unknown": 1})
+    device = content["objects"]["device"]
+    for wrong in ({"count": 5}, {"points": "ct"}, {"diameter_mm": 0}, {"noise_mm": -1}):
+        assert against_schema("beads", content | {"objects": {"device": device | wrong}})

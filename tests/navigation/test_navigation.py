@@ -80,6 +80,15 @@ flange_from_device
     return path
 
 
+def test_what_is_written_fits_its_schema(tmp_path: Path, against_schema: Callable[[str, Any], list[str]]) -> None:
+    run, content = navigated(tmp_path)
+    assert not against_schema("navigation", content)
+    assert against_schema("navigation", content | {"unknown": 1})
+    assert against_schema("navigation", content | {"femur_from_device": [[1.0]]})
+    assert main(["navigate", str(run)]) == 0  # without a robot
+    assert not against_schema("navigation", json.loads((run / "navigation.json").read_text(encoding="utf-8")))
+
+
 def navigated(tmp_path: Path, **settings: bool) -> tuple[Path, dict[str, Any]]:
     run = write_run(tmp_path / "run", **settings)
     assert main(["navigate", str(run), "--robot", str(write_flange(tmp_path / "robot.txt"))]) == 0

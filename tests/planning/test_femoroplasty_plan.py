@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path as File
 from typing import Any
 
@@ -217,8 +218,16 @@ def test_offsets_move_along_the_patient_and_not_moved_is_as_planned(prepared: Pr
         carried_out(prepared, around, plan.path, plan.cement, away, "path")
 
 
-def test_files_tell_the_plan(written: File, folder: File, prepared: Prepared, plan: FemoroplastyPlan) -> None:
+def test_files_tell_the_plan(
+    written: File,
+    folder: File,
+    prepared: Prepared,
+    plan: FemoroplastyPlan,
+    against_schema: Callable[[str, Any], list[str]],
+) -> None:
     content = json.loads((written / "plan.json").read_text())
+    assert not against_schema("plan", content)
+    assert against_schema("plan", content | {"unit": "m"})
     np.testing.assert_allclose(content["plan"]["entry_point"], plan.path.entry, atol=1e-9)
     assert content["planned"]["gain"] == pytest.approx(plan.gain)
     assert content["calibrated"] is False
@@ -255,7 +264,9 @@ def test_files_tell_the_plan(written: File, folder: File, prepared: Prepared, pl
     np.testing.assert_allclose(line["controlPoints"][1]["position"], plan.path.target, atol=1e-9)
 
 
-def test_commands_end_to_end(folder: File, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_end_to_end(
+    folder: File, capsys: pytest.CaptureFixture[str], against_schema: Callable[[str, Any], list[str]]
+) -> None:
     out = folder / "command"
     case, preset = str(folder), str(folder / "preset.yaml")
     assert main(["plan", case, "--out", str(out), "--volume-ml", "6", "--preset", preset, "--seed", "3"]) == 0
@@ -264,7 +275,10 @@ def test_commands_end_to_end(folder: File, capsys: pytest.CaptureFixture[str]) -
     assert main(["plan-offsets", str(out)]) == 0
     offsets = json.loads((out / "offsets.json").read_text())
     assert set(offsets["outcomes"]) == SIX | ENDS
-    planned = json.loads((out / "plan.json").read_text())["planned"]["yield_load_n"]
+    content = json.loads((out / "plan.json").read_text())
+    assert "response" in content
+    assert not against_schema("plan", content)
+    planned = content["planned"]["yield_load_n"]
     response = read_response(out / "plan.json")
     assert response is not None
     medial = np.array([-response.distance_mm, 0, 0, 0, 0])  # of a left femur; the quadratic goes through what was run

@@ -7,7 +7,7 @@
   let shown = null; // the last state with its drawing
   let chosen = null; // the landmark that keys, Remove and the next press are for
   let active = stacks[0]; // the image that keys and buttons move objects in
-  let busy = false, dragging = false, waiting = null; // a motion that the server does not know yet
+  let busy = false, dragging = false, leaving = false, waiting = null; // a motion that the server does not know yet
 
   const tool = () => (document.querySelector("input[name=tool]:checked") || { value: "" }).value;
   const running = () => Boolean(shown && shown.progress && shown.progress.state === "running");
@@ -27,19 +27,16 @@
 
   const ask = async (address, content) => {
     const options = content && { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) };
-    let answer;
     try {
-      answer = await fetch(address, options);
+      const answer = await fetch(address, options);
+      const found = (answer.headers.get("content-type") || "").startsWith("application/json") ? await answer.json() : null;
+      if (!found) say(await answer.text(), true);
+      $("lost").hidden = true;
+      return found;
     } catch {
-      $("lost").hidden = false;
+      $("lost").hidden = false; // before it answered, or in the middle of its answer
       return null;
     }
-    $("lost").hidden = true;
-    if (!(answer.headers.get("content-type") || "").startsWith("application/json")) {
-      say(await answer.text(), true);
-      return null;
-    }
-    return answer.json();
   };
   // One after the other: each is sent with the revision that the one before has left.
   let sent = Promise.resolve();
@@ -51,7 +48,10 @@
     if (state.message) say(state.message, true);
     else if (address === "change") say("");
   };
+  // An answer may be overtaken by a later one: what is shown never goes back.
+  const older = (state) => Boolean(shown) && (state.shown[0] - shown.shown[0] || state.shown[1] - shown.shown[1]) < 0;
   const show = (state) => {
+    if (older(state)) return;
     const before = shown && shown.progress && shown.progress.state, decided = shown && shown.decided;
     shown = { ...shown, ...state };
     const progress = shown.progress, on = running();
@@ -73,9 +73,13 @@
   const renew = () => {
     const note = document.querySelector("textarea[name=note]");
     if (note && note.value) say("There is a new result or decision. Reload the page to see it.", true);
-    else location.reload();
+    else if (!leaving) {
+      leaving = true; // a second reload would begin again with what the first waits for
+      location.reload();
+    }
   };
   const poll = async () => {
+    if (leaving) return;
     if (!busy && !dragging && shown) {
       const state = await ask("state");
       if (state && !busy && !dragging) {
@@ -162,9 +166,9 @@
 
   // Objects: motions gather while the server draws the last one
 
+  let moved = Promise.resolve(); // once the server knows all motions
   const nothing = () => ({ shift_px: [0, 0], turn_deg: 0, tilt_deg: [0, 0], depth_mm: 0 });
   const sendMoves = async () => {
-    if (busy) return;
     busy = true;
     while (waiting) {
       const move = waiting;
@@ -183,7 +187,7 @@
     waiting.turn_deg += part.turn_deg || 0;
     waiting.depth_mm += part.depth_mm || 0;
     hint();
-    sendMoves();
+    if (!busy) moved = sendMoves();
   };
   // Until the server has drawn it, the picture of the edges itself is moved.
   const hint = () => {
@@ -286,8 +290,8 @@
     else if (button.dataset.move) move(active, JSON.parse(button.dataset.move));
     else if (button.dataset.do) {
       say(button.dataset.do === "find" ? "Looking for landmarks …" : "");
-      post("change", { do: button.dataset.do });
-    } else if (button.dataset.start) post("start", { source: button.dataset.start });
+      moved.then(() => post("change", { do: button.dataset.do }));
+    } else if (button.dataset.start) moved.then(() => post("start", { source: button.dataset.start }));
     else if (button.id === "cancel") post("cancel", {});
     else if (button.id === "remove") post("change", { unmark: chosen });
     else if (button.classList.contains("enlarge")) {
