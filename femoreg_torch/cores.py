@@ -36,7 +36,8 @@ def on_all_cores(function: Callable[[T], R], items: Sequence[T], device: torch.d
 
 def shares(count: int, device: torch.device = _CPU) -> list[slice]:
     """A batch of so many in parts for `on_all_cores`, two for each core, so that none waits long for another."""
-    parts = 2 * numba.get_num_threads() if device.type == "cpu" else 1
+    cores = numba.get_num_threads() if device.type == "cpu" else 1
+    parts = 2 * cores if cores > 1 else 1
     size = max(1, -(-count // parts))
     return [slice(first, first + size) for first in range(0, max(1, count), size)]
 
