@@ -59,7 +59,7 @@ def one_run(case: Path, cores: int) -> tuple[Seconds, dict[str, int], float]:
     imports, _, _ = timed([sys.executable, "-c", _IMPORTS], cores)
     told = result["timings_s"]
     parts = {"start of Python and imports": imports, "reading": told["reading"], "detection": told["detection"]}
-    evaluations = {}
+    evaluations: dict[str, int] = {}
     for stage in result["stages"]:
         name = f"stage: {stage['name']}"
         at_once = cores > 1 and stage["view"] is not None  # views that do not wait for one another
