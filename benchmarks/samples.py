@@ -3,6 +3,7 @@
 import tempfile
 from collections import Counter
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numba as nb
@@ -48,7 +49,7 @@ def samples_of_a_registration(case: Path) -> dict[str, int]:
     from femoreg_torch.commands.register import register_into
 
     found: Counter[str] = Counter()
-    part = "before"
+    part, one_at_a_time = "before", Lock()
 
     def report(step: str, share: float) -> None:
         nonlocal part
@@ -56,7 +57,9 @@ def samples_of_a_registration(case: Path) -> dict[str, int]:
 
     def counting(kernel: Any) -> Any:
         def counted(*arguments: Any) -> Any:
-            found[part] += samples(*arguments)
+            taken = samples(*arguments)
+            with one_at_a_time:
+                found[part] += taken
             return kernel(*arguments)
 
         return counted

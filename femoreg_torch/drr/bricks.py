@@ -5,6 +5,7 @@ the chessboard distance; here it is counted in bricks, and rays travel in packet
 """
 
 from dataclasses import dataclass
+from threading import Lock
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -34,6 +35,7 @@ class BrickedVolume:
 
 
 _cache: WeakKeyDictionary[Volume, BrickedVolume] = WeakKeyDictionary()
+_one_at_a_time = Lock()  # threads that draw the same volume wait for its bricks
 
 
 def bricked(volume: Volume) -> BrickedVolume:
@@ -43,11 +45,12 @@ def bricked(volume: Volume) -> BrickedVolume:
     """
     if volume.data.is_inference():
         raise InputError("project: this volume was made under torch.inference_mode. Use torch.no_grad there.")
-    known = _cache.get(volume)
-    if known is None or known.version != volume.data._version:
-        known = _build(volume.data.detach().numpy(), volume.data._version)
-        _cache[volume] = known
-    return known
+    with _one_at_a_time:
+        known = _cache.get(volume)
+        if known is None or known.version != volume.data._version:
+            known = _build(volume.data.detach().numpy(), volume.data._version)
+            _cache[volume] = known
+        return known
 
 
 def _build(data: NDArray[np.float32], version: int) -> BrickedVolume:

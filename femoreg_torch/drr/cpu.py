@@ -17,7 +17,7 @@ from femoreg_torch.geometry.camera import Camera
 
 _flags = {"contract", "reassoc", "nsz", "arcp"}  # nan and inf keep their meaning
 _jit = nb.njit(cache=True, fastmath=_flags, error_model="numpy")
-_parallel = nb.njit(cache=True, fastmath=_flags, error_model="numpy", parallel=True)
+_parallel = nb.njit(cache=True, fastmath=_flags, error_model="numpy", parallel=True, nogil=True)
 
 _SHIFT = BRICK.bit_length() - 1
 _MOST_RUNS = 256  # per ray; a ray through 1,024 bricks that are filled and empty by turns has fewer

@@ -25,6 +25,7 @@ from scipy.sparse import csr_array
 from torch import Tensor
 
 from femoreg_torch.case.trace import StageRecord
+from femoreg_torch.cores import on_all_cores
 from femoreg_torch.drr import CPU, project, project_with_jacobian
 from femoreg_torch.geometry import (
     Camera,
@@ -309,10 +310,8 @@ def _views(
 
     With its `volume` they tell how their image changes as the device moves.
     """
-    seen = []
-    for _, view in scene.there([device.kind], range(scene.views)):
-        if chosen_views is not None and view not in chosen_views:
-            continue
+
+    def look(view: int) -> _View | None:
         camera = poses.camera(view, _LEVEL.camera(scene.carm.camera))
         pose = poses.camera_from(device.name)[view]
         paths = region_paths(device.voxels, pose, camera)
@@ -333,10 +332,14 @@ def _views(
             _, jacobian = project_with_jacobian(volume, pose[None], camera, centre, _LEVEL.step_mm)
             turn = torch.block_diag(*[poses.camera_from_camera1[view][:3, :3]] * 2)  # twists of camera 1 to this one's
             changes = (jacobian[0].flatten(0, 1)[chosen].double() @ turn).numpy() * _TWIST
-        if chosen_views is not None or len(chosen) >= _LEAST_PIXELS:
-            without, with_it = (values[chosen] for values in intensities)
-            seen.append(_View(view, chosen, paths[chosen], changes, without, with_it, _corners(chosen, camera)))
-    return seen
+        if chosen_views is None and len(chosen) < _LEAST_PIXELS:
+            return None
+        without, with_it = (values[chosen] for values in intensities)
+        return _View(view, chosen, paths[chosen], changes, without, with_it, _corners(chosen, camera))
+
+    there = [view for _, view in scene.there([device.kind], range(scene.views))]
+    asked = [view for view in there if chosen_views is None or view in chosen_views]
+    return [view for view in on_all_cores(look, asked, scene.device) if view is not None]
 
 
 def _begin(seen: list[_View], attenuation: Doubles) -> Doubles:

@@ -4,11 +4,14 @@ The C-arm's file, its poses, the plan, models that the images do not show as the
 """
 
 import math
+from collections.abc import Callable
+from itertools import chain
 
 import torch
 from scipy.spatial import cKDTree
 
 from femoreg_torch.case import Case
+from femoreg_torch.cores import on_all_cores
 from femoreg_torch.geometry import Poses, orbit_angles, pose_difference, transform_points
 from femoreg_torch.registration.covariance import PoseCovariance
 from femoreg_torch.registration.handedness import handedness
@@ -45,14 +48,15 @@ def doubts(
 
     `told` is the scene as the case tells it, `scene` the one with what was estimated of the images.
     """
-    return (
-        *doubts_about_the_carm(scene, poses, covariance, limits),
-        *doubts_about_the_views(scene, poses),
-        *doubts_about_motion(covariance),
-        *doubts_about_the_plan(case, scene),
-        *doubts_about_the_models(told, scene),
-        *doubts_about_handedness(scene, poses, imaging),
-    )
+    others: list[Callable[[], tuple[str, ...]]] = [
+        lambda: doubts_about_the_carm(scene, poses, covariance, limits),
+        lambda: doubts_about_the_views(scene, poses),
+        lambda: doubts_about_motion(covariance),
+        lambda: doubts_about_the_plan(case, scene),
+        lambda: doubts_about_the_models(told, scene),
+    ]
+    found = on_all_cores(lambda ask: ask(), others, scene.device)
+    return (*chain(*found), *doubts_about_handedness(scene, poses, imaging))
 
 
 def doubts_about_the_carm(scene: Scene, poses: Poses, covariance: PoseCovariance, limits: Limits) -> tuple[str, ...]:
@@ -163,12 +167,11 @@ def doubts_about_the_models(told: Scene, scene: Scene) -> tuple[str, ...]:
 
 def doubts_about_handedness(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
     """Objects whose mirror images fit better, in words."""
-    found = []
-    for name in poses.camera1_from:
-        fits = handedness(scene, poses, name, imaging)
-        if fits.mirrored > fits.similarity + _BETTER_MIRRORED:
-            found.append(
-                f"the {name} fits the images better mirrored (similarity {fits.mirrored:.3f} against "
-                f"{fits.similarity:.3f}): check the axes of the CT or model, and whether the images are mirrored"
-            )
-    return tuple(found)
+    names = list(poses.camera1_from)
+    every = on_all_cores(lambda name: handedness(scene, poses, name, imaging), names, scene.device)
+    return tuple(
+        f"the {name} fits the images better mirrored (similarity {fits.mirrored:.3f} against "
+        f"{fits.similarity:.3f}): check the axes of the CT or model, and whether the images are mirrored"
+        for name, fits in zip(names, every, strict=True)
+        if fits.mirrored > fits.similarity + _BETTER_MIRRORED
+    )

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from femoreg_torch.cores import on_all_cores, shares
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, Poses, transform_points, twist_rates
 from femoreg_torch.optimize import Quadratic, SmoothObjective
@@ -108,8 +110,21 @@ class ImageCosts:
 
     def __call__(self, deltas: Tensor) -> Tensor:
         """Costs (P, images) of deltas (P, Σ n_b), on the CPU; a device is waited for once."""
-        apart = deltas.split(1) if self._intrinsics(deltas) else [deltas]  # one camera draws a batch
-        return torch.cat([self._costs(part) for part in apart]).cpu()
+        motions = self._motions(deltas)
+        one_by_one = bool(self._intrinsics(deltas))  # one camera draws a batch
+        parts = [slice(n, n + 1) for n in range(len(deltas))] if one_by_one else shares(len(deltas), self._device)
+        views = list(dict.fromkeys(target.view for target in self.targets))
+        jobs = [(part, view) for part in parts for view in views]
+        found = on_all_cores(lambda job: self._costs(deltas, motions, *job), jobs, self._device)
+        by_view = {
+            view: iter(torch.cat([values for (_, of), values in zip(jobs, found, strict=True) if of == view]).unbind(1))
+            for view in views
+        }
+        return torch.stack([next(by_view[target.view]) for target in self.targets], 1).cpu()
+
+    @property
+    def _device(self) -> torch.device:
+        return self.targets[0].background.device
 
     @property
     def still(self) -> Tensor:
@@ -137,12 +152,18 @@ class ImageCosts:
         motions = self._motions(around)
         moving = [target for target in self.targets if target.moving]
         placed = [self._placed_with_rates(target, around, motions) for target in moving]
-        # What was drawn already, image and Jacobian by view and object.
-        seen: dict[tuple[int, str], tuple[Tensor, Tensor]] = {}
-        drawn = (
-            self._drawn(target, delta, poses, seen, unsure) for target, (poses, _) in zip(moving, placed, strict=True)
-        )
-        found = iter(zip(similarity_quadratics(drawn), placed, strict=True))
+        # What images of one view show alike is drawn once.
+        wanted: dict[tuple[int, str], tuple[_Target, Tensor]] = {}
+        for target, (poses, _) in zip(moving, placed, strict=True):
+            for name, pose in zip(target.moving, poses, strict=True):
+                wanted.setdefault((target.view, name), (target, pose))
+        drawn = on_all_cores(lambda each: self._image_and_jacobian(delta, each), list(wanted.items()), self._device)
+        seen = dict(zip(wanted, drawn, strict=True))
+        about = [
+            partial(self._changes, target, delta, poses, seen, unsure)
+            for target, (poses, _) in zip(moving, placed, strict=True)
+        ]
+        found = iter(zip(similarity_quadratics(about, self._device), placed, strict=True))
         models = []
         for target in self.targets:
             if target.moving:
@@ -156,18 +177,20 @@ class ImageCosts:
                 models.append(Quadratic(float(target.cost(target.background[None])), nothing[:1], nothing))
         return models
 
-    def _costs(self, deltas: Tensor) -> Tensor:
-        """Costs (P, images) of deltas that have the intrinsics of the first one.
+    def _costs(self, every: Tensor, motions: Sequence[tuple[Body, Tensor]], part: slice, view: int) -> Tensor:
+        """Costs (p, images) of one view for a part of deltas (P, Σ n_b), which has the intrinsics of its first one.
 
-        What images of one view show alike is drawn once.
+        What the view's images show alike is drawn once.
         """
         costs = []
-        motions = self._motions(deltas)
-        drawn: dict[int, tuple[tuple[str, ...], Tensor]] = {}  # by view, what was drawn last
+        deltas, motions = every[part], [(body, motion[part]) for body, motion in motions]
+        names: tuple[str, ...] = ()  # of what was drawn last
+        moving = torch.zeros(())
         for target in self.targets:
+            if target.view != view:
+                continue
             image = target.background.expand(len(deltas), *target.camera.shape)
             if target.moving:
-                names, moving = drawn.get(target.view, ((), torch.zeros(())))
                 if not set(names) <= set(target.moving):
                     names, moving = (), torch.zeros(())
                 left = [name for name in target.moving if name not in names]
@@ -175,7 +198,7 @@ class ImageCosts:
                     things = [self.objects[name] for name in left]
                     placed = self._placed(target, deltas, motions, left)
                     moving = moving + draw(things, placed, self._camera(target, deltas), self.step_mm)
-                drawn[target.view] = target.moving, moving
+                names = target.moving
                 image = image + moving
             costs.append(target.cost(image))
         return torch.stack(costs, 1)
@@ -227,7 +250,20 @@ class ImageCosts:
             twists.append(intrinsics.by_delta(target.view) @ chosen.T)
         return every[:, 0], torch.cat(twists)
 
-    def _drawn(
+    def _image_and_jacobian(
+        self, delta: Tensor, where: tuple[tuple[int, str], tuple[_Target, Tensor]]
+    ) -> tuple[Tensor, Tensor]:
+        """What one object at a pose (4, 4) shows to a view at a delta (n,), (H, W), and its changes (m, H, W)."""
+        (_, name), (target, pose) = where
+        centre = transform_points(pose, self.objects[name].reference_point[None])[0]
+        refining = bool(self._intrinsics(delta[None]))
+        camera = self._camera(target, delta[None])
+        image, jacobian = draw_with_jacobian(
+            self.objects[name], pose[None], camera, centre, self.step_mm, intrinsics=refining
+        )
+        return image[0], jacobian[0].movedim(-1, 0)
+
+    def _changes(
         self,
         target: _Target,
         delta: Tensor,
@@ -237,26 +273,20 @@ class ImageCosts:
     ) -> tuple[FixedSimilarity, Tensor, Tensor]:
         """The similarity of an image, what is drawn at a delta (n,), and its changes (H, W, m).
 
-        By the twists, and by what is `unsure` of what moves. That lies at `poses` (O, 4, 4). `seen` holds what was
-        drawn already.
+        By the twists, and by what is `unsure` of what moves. That lies at `poses` (O, 4, 4). `seen` holds each object
+        by itself in each view.
         """
         drawn, jacobians = target.background, []
         camera = self._camera(target, delta[None])
         refining = [intrinsics for intrinsics, _ in self._intrinsics(delta[None])]
         by_rays = target.background.new_zeros(3, *camera.shape)  # derivatives by the intrinsics
-        for name, pose in zip(target.moving, poses, strict=True):
-            if (target.view, name) not in seen:
-                centre = transform_points(pose, self.objects[name].reference_point[None])[0]
-                seen[target.view, name] = draw_with_jacobian(
-                    self.objects[name], pose[None], camera, centre, self.step_mm, intrinsics=bool(refining)
-                )
-            image, jacobian = seen[target.view, name]
-            drawn = drawn + image[0]
-            planes = jacobian[0].movedim(-1, 0)
+        for name in target.moving:
+            image, planes = seen[target.view, name]
+            drawn = drawn + image
             jacobians.append(planes[:6])
             for intrinsics in refining:
-                sliding = intrinsics.slide_rates(target.view, camera.sdd_mm).to(jacobian.dtype)
-                sliding = sliding.to(jacobian.device, non_blocking=True)
+                sliding = intrinsics.slide_rates(target.view, camera.sdd_mm).to(planes.dtype)
+                sliding = sliding.to(planes.device, non_blocking=True)
                 by_rays = by_rays + planes[6:] + torch.tensordot(sliding, planes[3:6], 1)
         jacobians += [by_rays] * len(refining)
         for name, difference in unsure:
@@ -286,10 +316,12 @@ def image_costs(
     """
     fitting = {name: replace(thing, volume=level.volume(thing.volume)) for name, thing in scene.objects.items()}
     scene = replace(scene, objects=fitting)
-    targets = tuple(
-        _target(scene, poses, bodies, render, image, level, similarity, weights, imaging) for image in images
-    )
-    return ImageCosts(scene.objects, poses, bodies, level.step_mm, targets)
+
+    def target(image: tuple[Kind, int]) -> _Target:
+        return _target(scene, poses, bodies, render, image, level, similarity, weights, imaging)
+
+    targets = on_all_cores(target, images, scene.device)
+    return ImageCosts(scene.objects, poses, bodies, level.step_mm, tuple(targets))
 
 
 def _camera_from(name: str, view: int, poses: Poses, motions: Sequence[tuple[Body, Tensor]], candidates: int) -> Tensor:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.case.trace import StageRecord
+from femoreg_torch.cores import on_all_cores
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, orbit_angles
@@ -20,6 +21,7 @@ from femoreg_torch.registration.step import (
     chosen_kinds,
     chosen_objects,
     lacking,
+    one_after_another,
 )
 from femoreg_torch.registration.weights import prepared
 from femoreg_torch.settings import check_within
@@ -67,11 +69,10 @@ class OrbitSearch:
         ]
 
     def run(self, scene: Scene, poses: Poses, seed: int) -> Iterator[StageRecord]:
-        """One search for every other view, see `Step`; nothing is random."""
-        for view in range(1, scene.views):
-            record = search_orbit(scene, poses, self, view)
-            poses = record.poses
-            yield record
+        """One search for every other view, see `Step`; nothing is random, and views do not wait for one another."""
+        views = range(1, scene.views)
+        records = on_all_cores(lambda view: search_orbit(scene, poses, self, view), views, scene.device)
+        yield from one_after_another(records, views)
 
 
 def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> StageRecord:

@@ -19,6 +19,7 @@ from torch import Tensor
 from femoreg_torch.case import Case
 from femoreg_torch.case.quality import CameraQuality, ObjectQuality, ViewQuality
 from femoreg_torch.case.trace import StageRecord
+from femoreg_torch.cores import on_all_cores
 from femoreg_torch.geometry import CArm, Poses, pose_difference, transform_points
 from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
 from femoreg_torch.registration.imaging import PLAIN, Imaging
@@ -66,7 +67,20 @@ def assess(
     `trace` is that of the steps which led there, `covariance` that of `final_covariance`, if it is known already.
     """
     covariance = covariance or final_covariance(scene, poses, imaging)
-    return {name: _assess_object(scene, poses, name, covariance, limits, imaging, trace) for name in poses.camera1_from}
+    images = [
+        (name, seen[0])
+        for name in poses.camera1_from
+        for view in range(scene.views)
+        if (seen := scene.there(scene.objects[name].shown_in, (view,)))
+    ]
+    found = on_all_cores(lambda each: _assess_view(scene, poses, *each, imaging), images, scene.device)
+    by_name = {
+        name: tuple(view for (of, _), view in zip(images, found, strict=True) if of == name)
+        for name in poses.camera1_from
+    }
+    return {
+        name: _assess_object(scene, poses, name, views, covariance, limits, trace) for name, views in by_name.items()
+    }
 
 
 def final_covariance(scene: Scene, poses: Poses, imaging: Imaging = PLAIN) -> PoseCovariance:
@@ -128,13 +142,11 @@ def _assess_object(
     scene: Scene,
     poses: Poses,
     name: str,
+    views: Sequence[ViewQuality],
     covariance: PoseCovariance,
     limits: Limits,
-    imaging: Imaging,
     trace: Sequence[StageRecord],
 ) -> ObjectQuality:
-    seen = (scene.there(scene.objects[name].shown_in, (view,)) for view in range(scene.views))
-    views = tuple(_assess_view(scene, poses, name, images[0], imaging) for images in seen if images)
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
     in_question = carm_in_question(scene, poses, covariance, limits)
@@ -151,7 +163,7 @@ def _assess_object(
     )
     told = reason or ("all views agree" if len(views) == scene.views else "all views that show it agree")
     return ObjectQuality(
-        views, uncertainty, pull, tuple(rotation), tuple(translation), displacement, reason is None, told
+        tuple(views), uncertainty, pull, tuple(rotation), tuple(translation), displacement, reason is None, told
     )
 
 

@@ -135,7 +135,7 @@ def region_paths(voxels: RegionVoxels, camera_from_volume: Tensor, camera: Camer
     return csc_array((paths, rows, begins), shape=(camera.shape[0] * camera.shape[1], len(voxels.ends))).tocsr()
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _gathered(pixels, mm, ends, height, width):  # type: ignore[no-untyped-def]
     """Pixels and paths of each region in turn, and where each begins, from voxels (n,) region by region."""
     rows, paths = np.empty(4 * len(mm), np.int32), np.empty(4 * len(mm))

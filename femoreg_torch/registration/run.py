@@ -19,6 +19,7 @@ from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import check_rigid
 from femoreg_torch.registration.doubts import doubts
+from femoreg_torch.registration.kernels import load_kernels
 from femoreg_torch.registration.plan import Plan, load_plan
 from femoreg_torch.registration.prepare import check_starts, prepare_scene
 from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance, path_covariance
@@ -124,11 +125,15 @@ def register_scene(
         starts = {name: thing.start for name, thing in scene.objects.items()}
     placed = [name for name, begin in starts.items() if begin.by_landmarks and name not in (start or {})]
     looks = plan.needs_segmentations or (bool(placed) and landmarks is None)
-    with ThreadPoolExecutor(max_workers=1) as beside:  # the network is read while the CT is
-        network = None
+    with ThreadPoolExecutor(max_workers=2) as beside:  # network and kernels are loaded while the CT is read
+        network = kernels = None
+        if device.type == "cpu":
+            kernels = beside.submit(load_kernels)
         if looks and find is None and case.anatomy is not None:
             network = beside.submit(network_detector, case, None, device)
         scene = (prepare_scene(case) if scene is None else scene).to(device)
+    if kernels is not None:
+        kernels.result()  # raises what went wrong there
     if start is not None:
         scene = _started_at(scene, start)
     clock["prepared"] = time.perf_counter()

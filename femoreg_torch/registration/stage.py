@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 
 from femoreg_torch.case.trace import StageRecord
+from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
 from femoreg_torch.optimize import Optimiser
@@ -27,6 +28,7 @@ from femoreg_torch.registration.step import (
     chosen_kinds,
     chosen_objects,
     lacking,
+    one_after_another,
 )
 from femoreg_torch.registration.weights import Weighting
 from femoreg_torch.settings import check_within
@@ -159,8 +161,17 @@ class Stage:
         return None
 
     def run(self, scene: Scene, poses: Poses, seed: int) -> Iterator[StageRecord]:
-        """The optimisation, or one for each other view from the poses after the one before, see `Step`."""
-        for views in self._parts(scene):
+        """The optimisation, or one for each other view from the poses after the one before, see `Step`.
+
+        Where only C-arms move, views do not wait for one another.
+        """
+        parts = self._parts(scene)
+        if len(parts) > 1 and self._moves_only_the_carm:
+            there = [views for views in parts if self.moving(scene, poses, views)]
+            records = on_all_cores(lambda views: run_stage(scene, poses, self, views, seed), there, scene.device)
+            yield from one_after_another(records, [view for view, *_ in there])
+            return
+        for views in parts:
             if self.moving(scene, poses, views):
                 record = run_stage(scene, poses, self, views, seed)
                 poses = record.poses

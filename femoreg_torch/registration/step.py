@@ -1,7 +1,10 @@
 """What every step of a plan is, and what the words in it stand for."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Protocol
+
+from torch import Tensor
 
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.errors import InputError
@@ -61,3 +64,18 @@ def check_known(names: Iterable[str], kinds: Iterable[Kind], scene: Scene, poses
         raise InputError(
             f"the images of this case hold no object “{name}”; there are: {', '.join(poses.camera1_from)}."
         )
+
+
+def one_after_another(records: Sequence[StageRecord], views: Sequence[int]) -> Iterator[StageRecord]:
+    """Records of single `views` (from 0), made from the same poses, as if each had begun where the one before ended."""
+    found: dict[int, Tensor] = {}
+
+    def with_found(poses: Poses) -> Poses:
+        for view, camera in found.items():
+            poses = poses.with_view(view, camera)
+        return poses
+
+    for record, view in zip(records, views, strict=True):
+        moments = tuple(replace(moment, poses=with_found(moment.poses)) for moment in record.moments)
+        yield replace(record, poses=with_found(record.poses), moments=moments)
+        found[view] = record.poses.camera_from_camera1[view]

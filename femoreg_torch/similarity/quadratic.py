@@ -7,12 +7,13 @@ differentiating twice, where J are the derivatives of the image I by the paramet
 Identifying and attacking the saddle point problem in high-dimensional non-convex optimization, NeurIPS 2014).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
 from femoreg_torch.similarity import cpu
 from femoreg_torch.similarity.interface import FixedSimilarity, SmoothFixedSimilarity
@@ -26,24 +27,29 @@ def similarity_quadratic(similarity: FixedSimilarity, image: Tensor, jacobian: T
     `jacobian` (H, W, n) holds the image's derivatives, see `SmoothFixedSimilarity`. Scores and hessian lie on the CPU,
     wherever the image is. Raises `InputError` for a similarity that cannot be differentiated twice.
     """
-    return similarity_quadratics([(similarity, image, jacobian)])[0]
+    return similarity_quadratics([lambda: (similarity, image, jacobian)], image.device)[0]
 
 
 def similarity_quadratics(
-    about: Iterable[tuple[FixedSimilarity, Tensor, Tensor]],
+    about: Sequence[Callable[[], tuple[FixedSimilarity, Tensor, Tensor]]], device: torch.device
 ) -> list[tuple[float, Tensor, Tensor]]:
-    """`similarity_quadratic` of several similarities, each with its image and jacobian; waits for a device once."""
-    similarities: list[FixedSimilarity] = []
-    found: list[tuple[Tensor | float, Tensor, Tensor]] = []
-    for similarity, image, jacobian in about:
-        similarities.append(similarity)
+    """`similarity_quadratic` of several similarities, each with its image and jacobian, which a function gives.
+
+    On the CPU, several are worked on at a time; another `device` is waited for once.
+    """
+
+    def there(
+        given: Callable[[], tuple[FixedSimilarity, Tensor, Tensor]],
+    ) -> tuple[FixedSimilarity, tuple[Tensor | float, Tensor, Tensor]]:
+        similarity, image, jacobian = given()
         if isinstance(similarity, SmoothFixedSimilarity):
-            found.append(similarity.quadratic(image, jacobian))
-        else:
-            found.append(_differentiated(similarity, image, jacobian))
+            return similarity, similarity.quadratic(image, jacobian)
+        return similarity, _differentiated(similarity, image, jacobian)
+
+    found = on_all_cores(there, about, device)
     return [
         (cost, scores, _checked(similarity, scores, hessian))
-        for similarity, (cost, scores, hessian) in zip(similarities, _on_the_cpu(found), strict=True)
+        for (similarity, _), (cost, scores, hessian) in zip(found, _on_the_cpu([f for _, f in found]), strict=True)
     ]
 
 

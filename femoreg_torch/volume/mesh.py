@@ -49,7 +49,7 @@ def check_closed(mesh: "trimesh.Trimesh", where: str) -> "trimesh.Trimesh":
     return mesh
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _accumulate(triangles: np.ndarray, coverage: np.ndarray) -> None:  # pragma: no cover (compiled)
     """Add every crossing of a triangle and a column of sub-samples to `coverage` (Z + 1, Y, X).
 
