@@ -114,11 +114,12 @@ class Calibration:
             unsure = tuple(difference.to(scene.device) for difference in fit.unsure)
             found = replace(thing, volume=fit.volume.to(scene.device), hardening=_HARDENING, unsure=unsure)
             objects = scene.objects | {name: found}
-            scene = replace(scene, objects=objects, scatter=scene.scatter | fit.scatter)
+            scene = replace(scene, objects=objects, scatter=scene.scatter or fit.scatter)
             poses = poses.with_object(name, fit.camera1_from)
             moving.append(name)
             told.append(f"{name}: {', '.join(f'{a:.2f}' for a in fit.attenuations)}/mm")
-            told += [f"scatter {ratio:.2f} in view {view + 1}" for view, ratio in fit.scatter.items()]
+            if fit.scatter is not None:
+                told.append(f"scattered light {fit.scatter:.2f} of the primary")
             cost, evaluations = fit.misfit, evaluations + fit.evaluations
         seconds = time.perf_counter() - began
         return scene, StageRecord(
@@ -140,7 +141,7 @@ class DeviceFit:
     volume: Volume  # attenuation, 1/mm
     camera1_from: Tensor  # (4, 4)
     attenuations: tuple[float, ...]  # 1/mm, of its materials
-    scatter: dict[int, float]  # per primary light but for the bones, by view (from 0), where the shadow is dark enough
+    scatter: float | None  # per primary light but for the bones; None where no shadow is dark enough
     misfit: float  # median difference of the logarithms of intensity
     evaluations: int
     unsure: tuple[Volume, ...]  # see `RigidObject`: blocks at the borders of materials, taken for the wrong one
@@ -191,19 +192,19 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
         scene.objects[name].volume if as_named else device.filled(attenuation),
         poses.camera1_from[name],
         tuple(attenuation.tolist()),
-        _scatter_ratios(scene, poses, seen, fit, device.regions),
+        _scatter_ratio(scene, poses, seen, fit, device.regions),
         float(np.median(misfit)),
         evaluations + used,
         () if borders is None else mistakes(share, borders, attenuation),
     )
 
 
-def _scatter_ratios(scene: Scene, poses: Poses, seen: list["_View"], fit: Doubles, regions: int) -> dict[int, float]:
-    """Scattered light per primary light behind all but what is drawn without the device, by view (from 0).
+def _scatter_ratio(scene: Scene, poses: Poses, seen: list["_View"], fit: Doubles, regions: int) -> float | None:
+    """Scattered light per primary light behind all but what is drawn without the device.
 
-    The median over pixels behind enough metal; views with too few of them are left out.
+    The median of pixels behind enough metal, and of views; None if no view has enough such pixels.
     """
-    found = {}
+    found = []
     for n, view in enumerate(seen):
         dark = view.paths @ fit[:regions] > -math.log(_DARK)
         if dark.sum() < _LEAST_PIXELS:
@@ -215,9 +216,8 @@ def _scatter_ratios(scene: Scene, poses: Poses, seen: list["_View"], fit: Double
         drawn = bones.flatten().double().numpy()[view.pixels]
         scattered = view.corners @ fit[_scatter_of(n, regions)]
         primary = np.maximum(view.without - scattered, 1e-3 * view.without) * np.exp(drawn)
-        ratio = float(np.median((scattered / primary)[dark]))
-        found[view.view] = min(max(ratio, _LEAST_SCATTER), _MOST_SCATTER)
-    return found
+        found.append(np.median((scattered / primary)[dark]))
+    return min(max(float(np.median(found)), _LEAST_SCATTER), _MOST_SCATTER) if found else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """What is seen of objects: metal that hardens the beam; and besides them, scattered light and soft tissue."""
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,7 @@ from femoreg_torch.registration.scene import RigidObject
 from femoreg_torch.settings import check_within
 from femoreg_torch.volume import Volume
 
+_AS_GUESSED = 2.5  # factor of the scattered light
 _TISSUE = Level(pixel_mm=3.1, step_mm=3.0)  # how finely the soft tissue is drawn; it is smooth
 
 
@@ -32,6 +34,15 @@ class Imaging:
 
     def __post_init__(self) -> None:
         check_within(self, scatter=(0, 10), tissue=(0, 10))
+
+    def as_seen(self, scatter: float | None) -> "Imaging":
+        """With what the images tell of the scattered light, if they do and say more or less by a factor of 2.5.
+
+        A guess that the images nearly agree with stays, so that the noise of what they tell does no harm.
+        """
+        if not scatter or not self.scatter or abs(math.log(scatter / self.scatter)) < math.log(_AS_GUESSED):
+            return self
+        return replace(self, scatter=scatter)
 
     def image(self, integrals: Tensor) -> Tensor:
         """What is seen of line integrals."""

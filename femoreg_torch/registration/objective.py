@@ -90,8 +90,7 @@ def _target(
     placing = [name for body in rigid for name in body.objects]
     looked_at = pixel_weights(scene, poses, render, placing, image, camera, level.step_mm, weights)
     fixed = prepared(scene, image, level, similarity, looked_at)
-    if imaging.scatter:
-        imaging = replace(imaging, scatter=scene.scatter.get(view, imaging.scatter))
+    imaging = imaging.as_seen(scene.scatter)
     tissue = None
     if imaging.tissue and scene.tissue is not None:
         tissue = imaging.tissue * tissue_integrals(scene.tissue, poses.camera_from(scene.anchor)[view], camera)

@@ -81,7 +81,7 @@ class Scene:
     tissue: Volume | None = None  # attenuation of the soft tissue, 1/mm, in the space of `anchor`
     outline: Outline | None = None  # what checks the start, in the space of `anchor`
     camera_from_camera1: Tensor | None = None  # (V, 4, 4) where the C-arm's poses are known and stay; None: to be found
-    scatter: dict[int, float] = field(default_factory=dict)  # of views (from 0), see `Imaging`, where it was estimated
+    scatter: float | None = None  # see `Imaging`, as the shadow of a device tells it
     left_on_left: tuple[int, ...] = ()  # views (from 0) seen from behind the patient: left is left
     missing: tuple[str, ...] = ()  # what the case lacks and what shutters hide, in words
 

@@ -102,9 +102,8 @@ def test_material_and_pose_of_a_device_that_is_told_as_one_solid(mixed: Scene) -
         end = difference.data[..., -20:]
         assert float(end.abs().max()) == 0
         assert float(difference.data.abs().max()) > 0
-    assert list(fit.scatter) == [0, 1, 2]
-    for scatter in fit.scatter.values():
-        assert 0.4 * SCATTERED < scatter < 1.5 * SCATTERED  # a beam that hardens a little more looks much the same
+    assert fit.scatter is not None
+    assert 0.4 * SCATTERED < fit.scatter < 1.5 * SCATTERED  # a beam that hardens a little more looks much the same
 
 
 def test_a_device_that_is_as_the_case_says_stays_so() -> None:
@@ -133,7 +132,7 @@ def test_named_parts_keep_their_bounds(mixed: Scene) -> None:
 def test_a_device_that_is_seen_through_tells_no_scatter() -> None:
     fit = fit_device(make_scene(0.02, 0.02), poses(), "device", "device")
     assert fit is not None
-    assert fit.scatter == {}
+    assert fit.scatter is None
 
 
 def test_without_images_of_the_device_there_is_nothing_to_do(mixed: Scene) -> None:

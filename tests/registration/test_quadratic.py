@@ -13,7 +13,7 @@ from femoreg_torch.registration import imaging as drawing
 from femoreg_torch.registration.imaging import PLAIN, Imaging, hardened, hardened_slope
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import Prior, image_costs, stage_objective
-from femoreg_torch.registration.scene import Body, Scene, reference_point_in_view
+from femoreg_torch.registration.scene import Body, reference_point_in_view
 from femoreg_torch.registration.weights import Weighting
 from femoreg_torch.similarity import GradNcc, Ncc, Similarity
 
@@ -30,7 +30,7 @@ def _joint_objective(  # type: ignore[no-untyped-def]
 ):
     """Every object and every C-arm but the first free, a little off the truth."""
     poses = true_poses()
-    scene = replace(make_scene(poses), segmentations=segmentations(poses), tissue=VOLUMES["femur"], scatter={1: 0.2})
+    scene = replace(make_scene(poses), segmentations=segmentations(poses), tissue=VOLUMES["femur"], scatter=0.1)
     metal = replace(scene.objects["device"], hardening=0.3)
     scene = replace(scene, objects=scene.objects | {"device": metal})
     for name, point in REFERENCE_POINTS.items():
@@ -109,19 +109,20 @@ def test_metal_hardens_the_beam_as_a_spectrum_of_attenuations_does(hardening: fl
     assert hardened(integrals, 0) is integrals
 
 
-def test_scatter_that_was_estimated_stands_in_for_that_of_the_preset() -> None:
+def test_scatter_that_the_images_tell_stands_in_for_a_guess_that_is_far_off() -> None:
     poses = true_poses()
-    scene, nothing = make_scene(poses), torch.zeros(1, 0, dtype=torch.float64)
+    nothing = torch.zeros(1, 0, dtype=torch.float64)
 
-    def costs(scene: Scene, scatter: float) -> torch.Tensor:
-        images = [("anatomy", 0), ("anatomy", 1)]
-        of_images = image_costs(scene, poses, (), ("pelvis",), images, _LEVEL, _SIMILARITY, (), Imaging(scatter))
-        return of_images(nothing)[0]
+    def cost(told: float | None, guess: float) -> float:
+        scene = replace(make_scene(poses), scatter=told)
+        images = [("anatomy", 0)]
+        costs = image_costs(scene, poses, (), ("pelvis",), images, _LEVEL, _SIMILARITY, (), Imaging(guess))
+        return float(costs(nothing))
 
-    told, estimated = costs(scene, 0.3), costs(replace(scene, scatter={1: 1.0}), 0.3)
-    assert estimated[0] == told[0]
-    assert estimated[1] == costs(scene, 1.0)[1] != told[1]
-    assert torch.equal(costs(replace(scene, scatter={1: 1.0}), 0.0), costs(scene, 0.0))  # none was asked for
+    assert cost(1.0, 0.3) == cost(None, 1.0) != cost(None, 0.3)
+    assert cost(0.05, 0.3) == cost(None, 0.05)
+    assert cost(0.5, 0.3) == cost(0.15, 0.3) == cost(None, 0.3)  # as good as the guess
+    assert cost(1.0, 0.0) == cost(None, 0.0)  # none was asked for
 
 
 def test_a_scene_without_soft_tissue_draws_none() -> None:
