@@ -74,8 +74,8 @@ _MOST_DEG, _MOST_MM = 8.0, 12.0  # that the device may move; more means that the
 _AS_NAMED = 0.3  # logarithm: one material so near to what the case names is that
 # Squared coefficient of variation of metal's attenuation over the spectrum of a tube at 75 kV, behind 200 mm of water:
 # 0.35, by the tables of `volume.materials`, 0.22 at 60 kV and 0.5 at 100 kV. Thick metal, which lets the hardest light
-# through, hardens the beam by less than the law of `hardened` says: 5 mm of steel as if it were 0.1.
-_HARDENING = 0.25
+# through, hardens the beam by less than the law of `hardened` says: 5 mm of steel as if it were 0.1. Between the two.
+_HARDENING = 0.2
 _DARK = (
     0.3  # of the light: pixels behind so much metal tell the scattered light; of a view there must be as many as count
 )
