@@ -61,9 +61,7 @@ _FAINTEST = 1e-3  # 1/mm
 _MOST_ATTENUATION = 2.5  # 1/mm: steel at 45 keV, of which 2 mm are opaque
 _VARIATION = 5.0  # weight of a step of 1/mm between all blocks
 _FLAT = 0.01  # 1/mm: steps that are none
-_TOLD_WITHIN = (
-    0.3  # standard deviation of the logarithm of a named material's attenuation: no file tells the tube's voltage
-)
+_TOLD_WITHIN = 0.3  # deviation of the logarithm of what a named material attenuates; nobody tells the tube's voltage
 _TOLD_WEIGHT = 1 / 200  # of one named material beside all pixels, whose misfits are alike over wide regions
 _MISFIT = 0.05  # of a logarithm of intensity; larger ones (something else has changed) count less
 _FEWEST_ROUNDS, _MOST_ROUNDS = 2, 4  # for blocks, and again for materials
@@ -76,9 +74,7 @@ _AS_NAMED = 0.3  # logarithm: one material so near to what the case names is tha
 # 0.35, by the tables of `volume.materials`, 0.22 at 60 kV and 0.5 at 100 kV. Thick metal, which lets the hardest light
 # through, hardens the beam by less than the law of `hardened` says: 5 mm of steel as if it were 0.1. Between the two.
 _HARDENING = 0.2
-_DARK = (
-    0.3  # of the light: pixels behind so much metal tell the scattered light; of a view there must be as many as count
-)
+_DARK = 0.3  # of the light: darker pixels tell the scattered light
 _LEAST_SCATTER, _MOST_SCATTER = 0.02, 1.0  # per primary light
 _LEAST_PASSING = 1e-3  # of 1 + h Σ a ℓ, where a motion of the device takes its path below nothing
 _CORNERS = 4  # of the box around the device: scattered light is interpolated between them
