@@ -35,9 +35,7 @@ class Loading:
     springs: Array  # (N, 3, 3), all of them
     head: Array  # (N,) stiffness of the head's pad along the force, N/mm
     trochanter: Array  # (N,) that of the other pad
-    cap_modulus: (
-        Array  # (E, 8) MPa that bone in caps has at least, as far as it fills the Gauss point's eighth; 0 elsewhere
-    )
+    cap_modulus: Array  # (E, 8) MPa that bone in caps has at least, by how far it fills a Gauss point's eighth; else 0
     span_mm: float  # length of the bone along the force between the pads
 
     @property
