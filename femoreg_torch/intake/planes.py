@@ -91,11 +91,12 @@ def _cell(name: str, image: Tensor) -> Picture:
     low, high = np.percentile(values, _ENDS_PERCENT)
     grey = ((values - low) / max(high - low, 1e-9) * 255).clip(0, 255).astype(np.uint8)
     shrink = (_CELL_PX - 6) / max(grey.shape)
-    small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    height, width = (max(1, round(n * shrink)) for n in grey.shape)
+    small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
     cell = np.zeros((_CELL_PX, _CELL_PX, 3), np.uint8)
     cell[: small.shape[0], : small.shape[1]] = small[..., None]
-    for colour, width in (((0, 0, 0), 4), (_YELLOW, 1)):  # seen on any background
-        cv2.putText(cell, name, (6, 18), _FONT, 0.45, colour, width, cv2.LINE_AA)
+    for colour, line in (((0, 0, 0), 4), (_YELLOW, 1)):  # seen on any background
+        cv2.putText(cell, name, (6, 18), _FONT, 0.45, colour, line, cv2.LINE_AA)
     return cell
 
 
