@@ -22,8 +22,8 @@ from torch import Tensor
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Camera
+from femoreg_torch.hdf5 import Hdf5File, open_hdf5
 from femoreg_torch.neighbours.frames import XregCamera
-from femoreg_torch.neighbours.hdf5 import matrix, names_in, numbers, open_hdf5, scalar, shape_of, text, there, whole
 from femoreg_torch.neighbours.xreg import camera_shape
 from femoreg_torch.volume import Volume
 
@@ -61,9 +61,9 @@ class Picture:
 def is_full_resolution(path: Path) -> bool:
     """Which of the two layouts a file has. Raises `InputError` if neither."""
     with open_hdf5(path) as file:
-        if there(file, "proj-params", path):
+        if file.there("proj-params"):
             return True
-        if there(file, "land-names", path):
+        if file.there("land-names"):
             return False
     raise InputError(f"{path}: neither layout of the DeepFluoro data set: no `proj-params` and no `land-names`.")
 
@@ -71,27 +71,26 @@ def is_full_resolution(path: Path) -> bool:
 def specimens(path: Path) -> list[str]:
     """Names of the specimens of a full-resolution file."""
     with open_hdf5(path) as file:
-        return [name for name in names_in(file, "/", path) if name != "proj-params"]
+        return [name for name in file.names("/") if name != "proj-params"]
 
 
 def read_specimen(path: Path, name: str) -> Specimen:
     """The CT, label map and landmarks of a specimen. Raises `InputError`."""
     with open_hdf5(path) as file:
         landmarks = {
-            mark: matrix(file, f"{name}/vol-landmarks/{mark}", (3,), path)
-            for mark in names_in(file, f"{name}/vol-landmarks", path)
+            mark: file.matrix(f"{name}/vol-landmarks/{mark}", (3,)) for mark in file.names(f"{name}/vol-landmarks")
         }
         ct = _volume(file, f"{name}/vol", np.float32, path)
         labels = _volume(file, f"{name}/vol-seg/image", np.uint8, path)
     return Specimen(name, ct, labels, landmarks)
 
 
-def _volume(file: Any, name: str, dtype: Any, path: Path) -> Volume:
-    values = numbers(file, f"{name}/pixels", 3, path).astype(dtype)
+def _volume(file: Hdf5File, name: str, dtype: Any, path: Path) -> Volume:
+    values = file.numbers(f"{name}/pixels", 3).astype(dtype)
     affine = torch.eye(4, dtype=torch.float64)
-    spacing = matrix(file, f"{name}/spacing", (3,), path)
-    affine[:3, :3] = matrix(file, f"{name}/dir-mat", (3, 3), path) @ torch.diag(spacing)
-    affine[:3, 3] = matrix(file, f"{name}/origin", (3,), path)
+    spacing = file.matrix(f"{name}/spacing", (3,))
+    affine[:3, :3] = file.matrix(f"{name}/dir-mat", (3, 3)) @ torch.diag(spacing)
+    affine[:3, 3] = file.matrix(f"{name}/origin", (3,))
     return Volume(torch.from_numpy(values), affine)
 
 
@@ -99,37 +98,37 @@ def read_pictures(path: Path, specimen: str) -> Iterator[Picture]:
     """The pictures of a specimen of a full-resolution file, one after the other."""
     with open_hdf5(path) as file:
         carm = XregCamera(
-            matrix(file, "proj-params/intrinsic", (3, 3), path),
-            matrix(file, "proj-params/extrinsic", (4, 4), path),
+            file.matrix("proj-params/intrinsic", (3, 3)),
+            file.matrix("proj-params/extrinsic", (4, 4)),
             camera_shape(file, "proj-params/num-rows", "proj-params/num-cols", path),
             (
-                scalar(file, "proj-params/pixel-row-spacing", path),
-                scalar(file, "proj-params/pixel-col-spacing", path),
+                file.scalar("proj-params/pixel-row-spacing"),
+                file.scalar("proj-params/pixel-col-spacing"),
             ),
         )
-        for name in names_in(file, f"{specimen}/projections", path):
+        for name in file.names(f"{specimen}/projections"):
             yield _picture(file, carm, specimen, name, path)
 
 
-def _picture(file: Any, carm: XregCamera, specimen: str, name: str, path: Path) -> Picture:
+def _picture(file: Hdf5File, carm: XregCamera, specimen: str, name: str, path: Path) -> Picture:
     group = f"{specimen}/projections/{name}"
-    pixels = numbers(file, f"{group}/image/pixels", 2, path).astype(np.float32)
+    pixels = file.numbers(f"{group}/image/pixels", 2).astype(np.float32)
     if pixels.shape != carm.shape:
         raise InputError(f"{path}, {group}: the image is {pixels.shape}, but `proj-params` say {carm.shape}.")
     turn = f"{group}/rot-180-for-up"
-    turned = there(file, turn, path) and bool(scalar(file, turn, path))
+    turned = file.there(turn) and bool(file.scalar(turn))
     display = Display("posterior", turned_deg=_DEGREES[turned])
     poses = {}
     for thing, told in _OBJECTS.items():
         key = f"{group}/gt-poses/cam-to-{told}-vol"
         trusted = f"{group}/gt-poses/{told}-good-fov"
-        if there(file, key, path) and (not there(file, trusted, path) or scalar(file, trusted, path)):
-            poses[thing] = carm.camera_from_lps(matrix(file, key, (4, 4), path), display)
-    known = [name for name in (f"{group}/gt-seg/pixels", f"{group}/gt-seg/image/pixels") if there(file, name, path)]
-    labels = numbers(file, known[0], 2, path).astype(np.uint8) if known else None
+        if file.there(key) and (not file.there(trusted) or file.scalar(trusted)):
+            poses[thing] = carm.camera_from_lps(file.matrix(key, (4, 4)), display)
+    known = [name for name in (f"{group}/gt-seg/pixels", f"{group}/gt-seg/image/pixels") if file.there(name)]
+    labels = file.numbers(known[0], 2).astype(np.uint8) if known else None
     if labels is not None and labels.shape != carm.shape:
         raise InputError(f"{path}, {known[0]}: labels are {labels.shape}, but the image is {carm.shape}.")
-    marks = names_in(file, f"{group}/gt-landmarks", path) if there(file, f"{group}/gt-landmarks", path) else []
+    marks = file.names(f"{group}/gt-landmarks") if file.there(f"{group}/gt-landmarks") else []
     return Picture(
         specimen,
         name,
@@ -138,7 +137,7 @@ def _picture(file: Any, carm: XregCamera, specimen: str, name: str, path: Path) 
         carm.camera,
         display,
         None if labels is None else torch.from_numpy(labels),
-        {mark: matrix(file, f"{group}/gt-landmarks/{mark}", (2,), path) for mark in marks},
+        {mark: file.matrix(f"{group}/gt-landmarks/{mark}", (2,)) for mark in marks},
         poses,
     )
 
@@ -149,28 +148,28 @@ def read_preprocessed(path: Path, detector: Camera, border_px: int = 50) -> Iter
     Pixel u of a file that keeps every s-th one is pixel 50 + s u of the detector.
     """
     with open_hdf5(path) as file:
-        count = whole(file, "land-names/num-lands", 0, _MOST_LANDMARKS, path)
-        names = [text(file, f"land-names/land-{n:02d}", path) for n in range(count)]
-        for specimen in names_in(file, "/", path):
+        count = file.whole("land-names/num-lands", 0, _MOST_LANDMARKS)
+        names = [file.text(f"land-names/land-{n:02d}") for n in range(count)]
+        for specimen in file.names("/"):
             if specimen == "land-names":
                 continue
             projs, segs, lands = (f"{specimen}/{part}" for part in ("projs", "segs", "lands"))
-            images, rows, columns = shape_of(file, projs, 3, path)
-            if shape_of(file, segs, 3, path) != (images, rows, columns):
+            images, rows, columns = file.shape(projs, 3)
+            if file.shape(segs, 3) != (images, rows, columns):
                 raise InputError(f"{path}, {segs}: the shape of `{projs}`, {(images, rows, columns)}, was expected.")
-            if shape_of(file, lands, 3, path) != (images, 2, count):
+            if file.shape(lands, 3) != (images, 2, count):
                 raise InputError(f"{path}, {lands}: {(images, 2, count)} numbers were expected.")
             camera = _coarser(detector, rows, columns, border_px, f"{path}, {projs}")
             for n in range(images):
-                marks = numbers(file, lands, 3, path, at=n, finite=False).astype(np.float64)  # infinite where unseen
+                marks = file.numbers(lands, 3, at=n, finite=False).astype(np.float64)  # infinite where unseen
                 yield Picture(
                     specimen,
                     f"{n:03d}",
-                    torch.from_numpy(numbers(file, projs, 3, path, at=n).astype(np.float32)),
+                    torch.from_numpy(file.numbers(projs, 3, at=n).astype(np.float32)),
                     "log",
                     camera,
                     Display("posterior"),
-                    torch.from_numpy(numbers(file, segs, 3, path, at=n).astype(np.uint8)),
+                    torch.from_numpy(file.numbers(segs, 3, at=n).astype(np.uint8)),
                     {name: torch.from_numpy(marks[:, m]) for m, name in enumerate(names)},
                     {},
                 )

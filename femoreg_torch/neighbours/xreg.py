@@ -14,7 +14,6 @@ Layout (xregH5ProjDataIO.cpp, xregH5CamModelIO.cpp, xregHDF5Internal.h):
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import SimpleITK as sitk
 import torch
@@ -23,8 +22,8 @@ from torch import Tensor
 from femoreg_torch.arrays import MOST_PIXELS, check_pixels
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import invert_rigid, read_itk_transform
+from femoreg_torch.hdf5 import Hdf5File, open_hdf5
 from femoreg_torch.neighbours.frames import XregCamera
-from femoreg_torch.neighbours.hdf5 import matrix, names_in, numbers, open_hdf5, scalar, text, there, whole
 
 _MOST_PROJECTIONS = 1000  # names have three digits
 
@@ -42,39 +41,39 @@ class Projection:
 def read_projections(path: Path) -> list[Projection]:
     """All projections of a file. Raises `InputError` for what is missing or of another shape."""
     with open_hdf5(path) as file:
-        if not there(file, "num-projs", path):
+        if not file.there("num-projs"):
             raise InputError(f"{path}: no projection data of xReg, it has no `num-projs`.")
         return list(_projections(file, path))
 
 
-def _projections(file: Any, path: Path) -> Iterator[Projection]:
-    for n in range(whole(file, "num-projs", 0, _MOST_PROJECTIONS, path)):
+def _projections(file: Hdf5File, path: Path) -> Iterator[Projection]:
+    for n in range(file.whole("num-projs", 0, _MOST_PROJECTIONS)):
         group = f"proj-{n:03d}"
         cam = f"{group}/cam"
         shape = camera_shape(file, f"{cam}/num-rows", f"{cam}/num-cols", path)
         camera = XregCamera(
-            matrix(file, f"{cam}/intrinsic", (3, 3), path),
-            matrix(file, f"{cam}/extrinsic", (4, 4), path),
+            file.matrix(f"{cam}/intrinsic", (3, 3)),
+            file.matrix(f"{cam}/extrinsic", (4, 4)),
             shape,
-            (scalar(file, f"{cam}/row-spacing", path), scalar(file, f"{cam}/col-spacing", path)),
-            text(file, f"{cam}/cam-coord-frame-type", path),
+            (file.scalar(f"{cam}/row-spacing"), file.scalar(f"{cam}/col-spacing")),
+            file.text(f"{cam}/cam-coord-frame-type"),
         )
         image = None
-        if there(file, f"{group}/img/pixels", path):
-            pixels = numbers(file, f"{group}/img/pixels", 2, path).astype("float32")
+        if file.there(f"{group}/img/pixels"):
+            pixels = file.numbers(f"{group}/img/pixels", 2).astype("float32")
             if pixels.shape != shape:
                 raise InputError(f"{path}, {group}: the image is {pixels.shape}, but its camera has {shape} pixels.")
             image = torch.from_numpy(pixels)
         marks = f"{group}/landmarks"
-        names = names_in(file, marks, path) if there(file, marks, path) else []
-        landmarks = {name: matrix(file, f"{marks}/{name}", (2,), path) for name in names}
+        names = file.names(marks) if file.there(marks) else []
+        landmarks = {name: file.matrix(f"{marks}/{name}", (2,)) for name in names}
         turn = f"{group}/rot-to-pat-up"
-        yield Projection(image, camera, landmarks, int(scalar(file, turn, path)) if there(file, turn, path) else None)
+        yield Projection(image, camera, landmarks, int(file.scalar(turn)) if file.there(turn) else None)
 
 
-def camera_shape(file: Any, rows: str, columns: str, path: Path) -> tuple[int, int]:
+def camera_shape(file: Hdf5File, rows: str, columns: str, path: Path) -> tuple[int, int]:
     """Rows and columns of a detector, from these entries. Raises `InputError` for more than any has."""
-    found = (whole(file, rows, 1, MOST_PIXELS, path), whole(file, columns, 1, MOST_PIXELS, path))
+    found = (file.whole(rows, 1, MOST_PIXELS), file.whole(columns, 1, MOST_PIXELS))
     check_pixels(path, *found)
     return found
 

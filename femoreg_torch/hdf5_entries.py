@@ -1,17 +1,16 @@
-"""The one door for HDF5: what a file claims is checked before it is read, and what h5py raises becomes one line.
+"""What stands in an HDF5 file: claims are checked before they are read, and what h5py raises becomes one line.
 
-A data set may claim any size without having a byte, keep its values in other files, or hold texts and records.
+A data set may claim any size without having a byte, keep its values in other files, or hold texts and records. These
+functions of an open file are called in a process of their own, see `hdf5`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
-import torch
-from torch import Tensor
 
 from femoreg_torch.arrays import check_claim
 from femoreg_torch.errors import InputError, shortened
@@ -32,10 +31,8 @@ def _reading(path: Path, name: str) -> Iterator[None]:
         ) from error
 
 
-def open_hdf5(path: Path) -> Any:
-    """An HDF5 file for reading. Raises `InputError` if it is missing or something else."""
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file.")
+def opened(path: Path) -> Any:
+    """An HDF5 file for reading. Raises `InputError` if it is something else."""
     try:
         return h5py.File(path, "r")
     except (OSError, RuntimeError, ValueError) as error:
@@ -48,7 +45,7 @@ def there(file: Any, name: str, path: Path) -> bool:
         return name in file
 
 
-def names_in(file: Any, group: str, path: Path) -> list[str]:
+def names(file: Any, group: str, path: Path) -> list[str]:
     """Names of the entries of a group, in order; `/` is the whole file. Raises `InputError` where there is none."""
     with _reading(path, group):
         if group not in file or not isinstance(file[group], h5py.Group):
@@ -68,7 +65,7 @@ def _entry(file: Any, name: str, path: Path) -> Any:
     return found
 
 
-def shape_of(file: Any, name: str, ndim: int, path: Path) -> tuple[int, ...]:
+def shape(file: Any, name: str, ndim: int, path: Path) -> tuple[int, ...]:
     """The shape of a data set of numbers with so many axes. Raises `InputError` for another one, and an empty one."""
     with _reading(path, name):
         found = _entry(file, name, path)
@@ -78,17 +75,17 @@ def shape_of(file: Any, name: str, ndim: int, path: Path) -> tuple[int, ...]:
         return tuple(int(n) for n in found.shape)
 
 
-def numbers(file: Any, name: str, ndim: int, path: Path, at: int | None = None, finite: bool = True) -> Any:
+def numbers(file: Any, name: str, ndim: int, at: int | None, finite: bool, path: Path) -> Any:
     """The numbers of a data set with so many axes, or those at place `at` of its first axis.
 
     Raises `InputError` for texts and records, another shape, more than the file can hold, and, where they should be
     `finite`, for NaN and infinity.
     """
-    shape = shape_of(file, name, ndim, path)
+    known = shape(file, name, ndim, path)
     with _reading(path, name):
         found = file[name]
         # compressed by whatever filter; values that were never written take no byte, and are none
-        check_claim(path, shape if at is None else shape[1:], found.dtype.itemsize, Path(path).stat().st_size)
+        check_claim(path, known if at is None else known[1:], found.dtype.itemsize, Path(path).stat().st_size)
         values = np.asarray(found[...] if at is None else found[at])
     if finite and values.dtype.kind == "f" and not np.isfinite(values).all():
         raise InputError(f"{path}, {name}: finite numbers were expected, found NaN or infinity.")
@@ -123,14 +120,32 @@ def text(file: Any, name: str, path: Path) -> str:
     raise InputError(f"{path}, {name}: a word was expected.")
 
 
-def matrix(file: Any, name: str, shape: tuple[int, ...], path: Path) -> Tensor:
+def matrix(file: Any, name: str, shape: Sequence[int], path: Path) -> Any:
     """Finite numbers of a shape, float64; vectors may stand as a column."""
     with _reading(path, name):
         found = _entry(file, name, path)
         column = len(shape) == 1 and found.size == shape[0]
-        fits = found.dtype.kind in "buif" and (column or found.shape == shape)
+        fits = found.dtype.kind in "buif" and (column or found.shape == tuple(shape))
         values = np.asarray(found, dtype=np.float64).reshape(shape) if fits else np.empty(0)
         if not fits or not np.isfinite(values).all():
             expected = " × ".join(map(str, shape))
             raise InputError(f"{path}, {name}: {expected} finite numbers were expected, found {found.shape}.")
-    return torch.from_numpy(values)
+    return values
+
+
+def listed(file: Any, name: str, most: int, path: Path) -> list[float]:
+    """At most so many finite numbers, perhaps none."""
+    with _reading(path, name):
+        found = _entry(file, name, path)
+        if found.dtype.kind not in "buif" or found.size > most:
+            raise InputError(f"{path}, {name}: at most {most} numbers were expected.")
+        values = np.asarray(found, dtype=np.float64).ravel()
+        if not np.isfinite(values).all():
+            raise InputError(f"{path}, {name}: its numbers are not all finite.")
+    return values.tolist()
+
+
+# what a process that has a file open can be asked; the file comes first, then a name and so on, the path last
+QUESTIONS: dict[str, Callable[..., Any]] = {
+    question.__name__: question for question in (there, names, shape, numbers, scalar, whole, text, matrix, listed)
+}

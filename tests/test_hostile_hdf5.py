@@ -1,5 +1,8 @@
-"""HDF5 files that are not what they say: one line that names file and entry, and nothing large is allocated."""
+"""HDF5 files that are not what they say: one line that names file and entry, nothing large is allocated, no hang."""
 
+import os
+import signal
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +14,7 @@ import pytest
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import centred_camera
-from femoreg_torch.neighbours import hdf5
+from femoreg_torch.hdf5 import open_hdf5
 from femoreg_torch.neighbours.deepfluoro import is_full_resolution, read_preprocessed
 
 DETECTOR = centred_camera(1020.0, (0.4, 0.4), (820, 820))
@@ -88,10 +91,53 @@ def test_a_claim_is_compared_with_the_file_before_it_is_read(tmp_path: Path) -> 
     with h5py.File(path, "w") as file:
         file.create_dataset("vast", (2**20, 2**20), "f4", chunks=True)
         file.create_dataset("long", (2**27,), "f8", chunks=True)
-    with h5py.File(path) as file:
+    with open_hdf5(path) as file:
         for name, axes in (("vast", 2), ("long", 1)):
             with pytest.raises(InputError, match=r"voxels are more than|cannot hold"):
-                hdf5.numbers(file, name, axes, path)
+                file.numbers(name, axes)
+
+
+def test_numbers_come_as_they_are_stored(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    stored = {
+        "big": np.arange(12, dtype=">i2").reshape(3, 4),
+        "half": np.array([[0.5, -2.0]], np.float16),
+        "truth": np.array([[True, False]]),
+        "packed": np.arange(10_000.0).reshape(100, 100),
+    }
+    with h5py.File(path, "w") as file:
+        for name, values in stored.items():
+            file.create_dataset(name, data=values, compression="gzip" if name == "packed" else None)
+    with open_hdf5(path) as read:
+        for name, values in stored.items():
+            found = read.numbers(name, 2)
+            assert found.dtype == values.dtype
+            assert (found == values).all()
+            assert (read.numbers(name, 2, at=0) == values[0]).all()
+
+
+def test_a_text_that_the_library_follows_for_ever(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """The heap of texts says that its free space has the size 0, so that the library looks there for ever."""
+    path = preprocessed(tmp_path / "ds.h5")
+    content = path.read_bytes()
+    heap = content.index(b"GCOL")
+    path.write_bytes(content[: heap + 32] + bytes(24) + content[heap + 56 :])
+    began = time.perf_counter()
+    assert main(["measure", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert time.perf_counter() - began < 20  # 3 s of the processor's
+    told = capfd.readouterr().err
+    assert "comes to no end" in told
+    assert told.count("\n") == 1
+
+
+def test_a_reader_that_dies_is_a_refused_file(tmp_path: Path) -> None:
+    """As it would by a crash of the library."""
+    with open_hdf5(preprocessed(tmp_path / "ds.h5")) as file:
+        assert file.names("/") == ["01", "land-names"]
+        (child,) = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+        os.kill(int(child), signal.SIGSEGV)
+        with pytest.raises(InputError, match="crashes on it"):
+            file.names("/")
 
 
 @pytest.mark.parametrize("cut", [0, 8, 100, 1000, -100])
