@@ -1,9 +1,18 @@
 """`femoreg plan CASE` and what a plan is worth beside its place: `plan-offsets`, `plan-robustness`."""
 
 from pathlib import Path
+from typing import Literal
 
 
-def plan(case: Path, *, out: Path, volume_ml: float = 9.5, preset: str = "default", seed: int = 0) -> None:
+def plan(
+    case: Path,
+    *,
+    out: Path,
+    volume_ml: float = 9.5,
+    preset: str = "default",
+    seed: int = 0,
+    device: Literal["cpu", "cuda", "auto"] = "cpu",
+) -> None:
     """Plan where cement is injected into a femur: entry point, direction, amounts, and the modelled gain.
 
     Writes into OUT: plan.json (path in the form that a case's `plan:` takes, injections, loads, settings),
@@ -16,11 +25,12 @@ def plan(case: Path, *, out: Path, volume_ml: float = 9.5, preset: str = "defaul
         volume_ml: Cement in ml.
         preset: Name in configs/planning, or a YAML file; it may say `extends: default`.
         seed: Of the search for the path; same seed, same plan.
+        device: Where linear systems are solved: cpu, cuda (the first GPU), or auto, a GPU where there is one.
     """
     from rich.console import Console
 
     from femoreg_torch.case import read_case
-    from femoreg_torch.commands.telling import progress_report
+    from femoreg_torch.commands.telling import progress_report, tell_device
     from femoreg_torch.files import check_new_folder, new_folder
     from femoreg_torch.planning.figures import curves_figure, overlay_figure, save
     from femoreg_torch.planning.plan import make_plan
@@ -30,8 +40,9 @@ def plan(case: Path, *, out: Path, volume_ml: float = 9.5, preset: str = "defaul
 
     console = Console()
     check_new_folder(out, case)
+    place = tell_device(console, device)
     content = read_case(case)
-    prepared = prepare(content, load_planning(preset))
+    prepared = prepare(content, load_planning(preset), device=place)
     with progress_report(console, "optimal cement") as report:
         found = make_plan(prepared, volume_ml, seed, report)
     with new_folder(out) as folder:
@@ -52,7 +63,13 @@ def plan(case: Path, *, out: Path, volume_ml: float = 9.5, preset: str = "defaul
     console.print(f"Written to {out}")
 
 
-def plan_offsets(plan: Path, *, distance_mm: float | None = None, case: Path | None = None) -> None:
+def plan_offsets(
+    plan: Path,
+    *,
+    distance_mm: float | None = None,
+    case: Path | None = None,
+    device: Literal["cpu", "cuda", "auto"] = "cpu",
+) -> None:
     """Move a plan by some mm in six directions, and its end in four, and tell what is left of its gain.
 
     Writes offsets.json and offsets.png into PLAN, and into its plan.json a quadratic through these loads, by which
@@ -63,10 +80,11 @@ def plan_offsets(plan: Path, *, distance_mm: float | None = None, case: Path | N
         plan: Folder that `femoreg plan` wrote.
         distance_mm: How far; as in the plan's settings if not given.
         case: Folder of the case, if it is no longer where it was planned from.
+        device: Where linear systems are solved, as for `femoreg plan`.
     """
     from rich.console import Console
 
-    from femoreg_torch.commands.telling import progress_report
+    from femoreg_torch.commands.telling import progress_report, tell_device
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import write_json
     from femoreg_torch.planning.figures import offsets_figure, save
@@ -75,7 +93,7 @@ def plan_offsets(plan: Path, *, distance_mm: float | None = None, case: Path | N
     from femoreg_torch.planning.report import add_response
 
     console = Console()
-    again = Replan(plan, case)
+    again = Replan(plan, case, tell_device(console, device))
     far = again.stored.planning.offsets.distance_mm if distance_mm is None else distance_mm
     if not far > 0:
         raise InputError(f"--distance-mm: a number above 0 was expected, found {far:g}.")
@@ -103,6 +121,7 @@ def plan_robustness(
     draws: int | None = None,
     seed: int = 0,
     case: Path | None = None,
+    device: Literal["cpu", "cuda", "auto"] = "cpu",
 ) -> None:
     """Carry a plan out under errors of registration, shifts and turns, and tell how its gain is distributed.
 
@@ -119,11 +138,12 @@ def plan_robustness(
         draws: How many; as in the plan's settings if not given.
         seed: Of the draws.
         case: Folder of the case, if it is no longer where it was planned from.
+        device: Where linear systems are solved, as for `femoreg plan`.
     """
     import numpy as np
     from rich.console import Console
 
-    from femoreg_torch.commands.telling import progress_report
+    from femoreg_torch.commands.telling import progress_report, tell_device
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import write_json
     from femoreg_torch.planning.figures import robustness_figure, save
@@ -145,7 +165,7 @@ def plan_robustness(
         assert covariance is not None  # one of the two
         variance = read_covariance(covariance)
         moves = normal_moves(np.zeros(len(variance)) if mean is None else np.array(mean), variance, count, seed)
-    again = Replan(plan, case)
+    again = Replan(plan, case, tell_device(console, device))
     with progress_report(console, "draws") as report:
         outcomes = []
         for n, move in enumerate(moves):

@@ -34,7 +34,7 @@ def on_mesh(prepared: Prepared, cement: Array, size_mm: float) -> MeshRow:
     bone, planning = prepared.bone, prepared.planning
     model = make_model(bone, planning, size_mm)
     loading = make_loading(model, bone.femur, planning.load)
-    press = Press(model.mesh, loading, planning.bone.poisson)
+    press = Press(model.mesh, loading, planning.bone.poisson, prepared.press.device)
     other = dataclasses.replace(prepared, model=model, press=press)
     began = time.process_time()
     without = other.curve().yield_load_n

@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.element import TENSOR, elastic_stiffness, moduli, template
 from femoreg_torch.planning.laws import Material
@@ -53,10 +55,13 @@ class Curve:
 
 
 class Press:
-    """A femur under its pads: mesh, loading and the pattern of the matrix, which serve any material."""
+    """A femur under its pads: mesh, loading and the pattern of the matrix, which serve any material.
 
-    def __init__(self, mesh: Mesh, loading: Loading, poisson: float) -> None:
-        self.mesh, self.loading = mesh, loading
+    On `device` its linear systems are solved.
+    """
+
+    def __init__(self, mesh: Mesh, loading: Loading, poisson: float, device: torch.device = CPU) -> None:
+        self.mesh, self.loading, self.device = mesh, loading, device
         self._poisson = poisson
         self._assembler = Assembler(mesh)
 
@@ -74,7 +79,7 @@ class Press:
         hard = self.hardened(material)
         stiffness = elastic_stiffness(hard.modulus, self._poisson) * self.mesh.size_mm
         matrix = self._assembler.matrix(stiffness, self.loading.springs)
-        solver = Solver(matrix, self.mesh.nodes)
+        solver = Solver(matrix, self.mesh.nodes, self.device)
         u = solver.solve(matrix, self.loading.push(1.0).ravel(), _LINEAR_TOLERANCE).reshape(-1, 3)
         return u, self.loading.load(1.0, u), solver
 

@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from femoreg_torch.case import Case
+from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.calibration import calibrate
 from femoreg_torch.planning.curve import Curve, Press
@@ -43,13 +45,11 @@ class Prepared:
             slice(start, start + size) for start, size in zip(self.bone.femur.corner, cement.shape, strict=True)
         )
         data[box] = cement >= 0.5
-        import torch
-
         return self.ct.with_data(torch.from_numpy(np.ascontiguousarray(data.transpose(2, 1, 0))))
 
 
-def prepare(case: Case, planning: Planning, size_mm: float | None = None) -> Prepared:
-    """Read CT and labels of a case and build the model of the femur of its side.
+def prepare(case: Case, planning: Planning, size_mm: float | None = None, device: torch.device = CPU) -> Prepared:
+    """Read CT and labels of a case and build the model of the femur of its side; `device` solves its linear systems.
 
     Raises `InputError` for a case without side or head centre, and for what its CT and label map do not allow.
     """
@@ -65,5 +65,5 @@ def prepare(case: Case, planning: Planning, size_mm: float | None = None) -> Pre
     bone = make_bone(femur, calibrate(ct.data.numpy(), planning.calibration), planning)
     model = make_model(bone, planning, size_mm)
     loading = make_loading(model, femur, planning.load)
-    press = Press(model.mesh, loading, planning.bone.poisson)
+    press = Press(model.mesh, loading, planning.bone.poisson, device)
     return Prepared(ct, bone, model, press, planning)

@@ -6,10 +6,12 @@ from pathlib import Path as File
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from femoreg_torch.case import read_case
 from femoreg_torch.case.model import Side
+from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.offsets import Outcome, carried_out
 from femoreg_torch.planning.path import Path, Surroundings
@@ -24,9 +26,10 @@ Array = NDArray[np.float64]
 class Replan:
     """A stored plan, its femur, and its loads on this machine: without cement and as planned, with nothing moved."""
 
-    def __init__(self, folder: File, case: File | None = None) -> None:
+    def __init__(self, folder: File, case: File | None = None, device: torch.device = CPU) -> None:
         self.stored = read_plan(folder)
-        self.prepared = until_yield(prepare(read_case(case or self.stored.case), self.stored.planning))
+        content = read_case(case or self.stored.case)
+        self.prepared = until_yield(prepare(content, self.stored.planning, device=device))
         femur = self.prepared.bone.femur
         self.side: Side = femur.side
         self.around = Surroundings(self.prepared.bone)

@@ -1,16 +1,16 @@
 """The equations of a mesh: assembly, and conjugate gradients with algebraic multigrid."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy import sparse
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.mesh import Mesh
-
-if TYPE_CHECKING:
-    from scipy.sparse.linalg import LinearOperator
+from femoreg_torch.planning.multigrid import Cycle, conjugate_gradients, on_device
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class Assembler:
 class Solver:
     """Conjugate gradients, preconditioned by the smoothed aggregation of an elastic matrix that is set up once."""
 
-    def __init__(self, elastic: sparse.bsr_array, points: Array) -> None:
+    def __init__(self, elastic: sparse.bsr_array, points: Array, device: torch.device) -> None:
         import pyamg
 
         matrix = sparse.bsr_matrix(elastic)
@@ -73,39 +73,25 @@ class Solver:
             )
         finally:
             np.random.set_state(state)  # noqa: NPY002
-        self._preconditioner: LinearOperator = levels.aspreconditioner(cycle="V")
+        self._device = None if device.type == "cpu" else device
+        self._cycle: Callable[[Any], Any] = (
+            levels.aspreconditioner(cycle="V").matvec if self._device is None else Cycle(levels, self._device)
+        )
 
     def solve(self, matrix: sparse.bsr_array, force: Array, tolerance: float) -> Array:
         """Displacements (3N,) under forces (3N,). Raises `InputError` where the iteration does not converge."""
-        found, left = self._conjugate_gradients(matrix, force, tolerance)
+        if self._device is None:
+            found, left = conjugate_gradients(matrix, force, self._cycle, tolerance, _MOST_CG)
+        else:
+            there = on_device(matrix, self._device), torch.from_numpy(force).to(self._device)
+            moved, left = conjugate_gradients(*there, self._cycle, tolerance, _MOST_CG)
+            found = moved.cpu().numpy()
         if left > 1e3 * tolerance:
             raise InputError(
                 f"solver: {_MOST_CG} iterations left a residual of {left:.1e} of the load. The bone hangs together by "
                 "almost nothing: check label and calibration, or use smaller steps (curve.step_mm)."
             )
-        return found
-
-    def _conjugate_gradients(self, matrix: sparse.bsr_array, force: Array, tolerance: float) -> tuple[Array, float]:
-        """The solution, and its residual over the force. Ends early where the matrix is no longer positive."""
-        x, residual = np.zeros_like(force), force.copy()
-        whole = float(np.linalg.norm(force))
-        if whole == 0.0:
-            return x, 0.0
-        direction = ready = self._preconditioner @ residual
-        product = residual @ ready
-        for _ in range(_MOST_CG):
-            image: Any = matrix @ direction
-            curvature = direction @ image
-            if curvature <= 0:
-                break
-            x += (step := product / curvature) * direction
-            residual -= step * image
-            if np.linalg.norm(residual) <= tolerance * whole:
-                break
-            ready = self._preconditioner @ residual
-            product, before = residual @ ready, product
-            direction = ready + product / before * direction
-        return x, float(np.linalg.norm(residual)) / whole
+        return np.asarray(found)
 
 
 def rigid_modes(points: Array) -> Array:

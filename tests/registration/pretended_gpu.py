@@ -59,7 +59,7 @@ class PretendedGpu(TorchFunctionMode):
     def holds(self, tensor: Tensor) -> bool:
         """Whether a tensor lies on the device."""
         with torch._C.DisableTorchFunction():
-            known = self._there.get(tensor.untyped_storage()._cdata)
+            known = self._there.get(_storage(tensor)._cdata)
         return known is not None and not known.expired()
 
     def take(self, found: Any) -> Any:
@@ -67,7 +67,7 @@ class PretendedGpu(TorchFunctionMode):
         with torch._C.DisableTorchFunction():
             for tensor in tree_leaves(found):
                 if isinstance(tensor, Tensor):
-                    reference = StorageWeakRef(tensor.untyped_storage())
+                    reference = StorageWeakRef(_storage(tensor))
                     self._there[reference.cdata] = reference
         return found
 
@@ -123,8 +123,13 @@ class PretendedGpu(TorchFunctionMode):
             return self.take(moved) if after else moved
         if waits:
             self.waits["download" if before else "upload"] += 1
-        moved = moved.clone() if moved.untyped_storage()._cdata == tensor.untyped_storage()._cdata else moved
+        moved = moved.clone() if _storage(moved)._cdata == _storage(tensor)._cdata else moved
         return self.take(moved) if after else moved
+
+
+def _storage(tensor: Tensor) -> torch.UntypedStorage:
+    """Where a tensor's values lie; of a sparse one, those that are no zeros."""
+    return (tensor.values() if tensor.layout == torch.sparse_csr else tensor).untyped_storage()
 
 
 def _masked(index: Any) -> bool:
