@@ -2,8 +2,8 @@
 
 The network says which bone lies where, to about a coarse voxel; in that band the CT decides. A voxel there is bone if
 it is brighter than a threshold between soft tissue and the brightest bone near it, as edges of a blurred plate lie at a
-part of its height (Prevrhal et al., Phys. Med. Biol. 44, 1999, of cortex in CT). Marrow is kept by the network's share
-and by closing.
+part of its height (Prevrhal et al., Phys. Med. Biol. 44, 1999, of cortex in CT). A low threshold first, so that cortex
+has no gaps and encloses its marrow, which is kept by the network's share and by closing; then the edge itself.
 """
 
 from dataclasses import dataclass
@@ -24,12 +24,17 @@ Mask = NDArray[np.bool_]
 _FINEST_MM = 1.0  # finer voxels are averaged; labels then lie within half a millimetre
 _MARGIN_MM = 9.0  # around what the network labels
 _SOFT_HU = 50.0
-_EDGE_SHARE = 0.35  # of the way from soft tissue to the brightest bone within `_NEAR_MM`
-_LOWEST_EDGE_HU, _HIGHEST_EDGE_HU = 130.0, 300.0
+# Of the way from soft tissue to the brightest bone within `_NEAR_MM`, and bounds in HU. Above the first, thin and
+# blurred cortex still hangs together, so that marrow is enclosed. At half the way lies the edge of a plate that is wide
+# beside the scanner's blur; voxels that are reached from outside are asked for that.
+_WHOLE_SHARE, _LOWEST_WHOLE_HU, _HIGHEST_WHOLE_HU = 0.35, 130.0, 300.0
+_EDGE_SHARE, _LOWEST_EDGE_HU, _HIGHEST_EDGE_HU = 0.5, 130.0, 600.0
+_RIM_MM = 1.5  # depth of what is asked so, at least one voxel
 _NEAR_MM = 3.0
 _SOFTNESS_HU = 100.0  # about the threshold, over which the CT's evidence goes from −1 (no bone) to 1 (bone)
 _CT_WEIGHT = 0.35  # of the CT's evidence beside the network's share: 0.15 to 0.85 is the band where the CT decides
 _JOINT_WEIGHT = 2.0  # where hip bone and femur are equally likely lies the joint space, and the CT decides
+_JOINT_SHARE = 0.05  # of either bone: where the joint has settled the edge
 _METAL_HU, _METAL_MM = 2300.0, 3.0  # in metal and so far around it the network decides alone
 _CLOSE_MM = 2.0  # gaps so wide within a bone are marrow, where the network agrees
 _CLOSED_SHARE = 0.4
@@ -61,9 +66,14 @@ def refined_labels(ct: Volume, shares: Tensor, grid: Volume, anatomy: Anatomy) -
         return labels
     region = _region(ct, coarse > 0, grid)
     bone, which, joint = _on_region(shares, region, ct, grid, anatomy)
-    found = torch.where(_is_bone(bone - _JOINT_WEIGHT * joint, region), which, 0).numpy()
+    brightest = _largest_near(region.hu.clamp(-200, 1500), _radius(_NEAR_MM, region.spacing))
+    whole = _threshold(brightest, _WHOLE_SHARE, _LOWEST_WHOLE_HU, _HIGHEST_WHOLE_HU)
+    found = torch.where(_is_bone(bone - _JOINT_WEIGHT * joint, region, whole), which, 0).numpy()
     for number in range(1, shares.shape[0]):
         found = _whole(found, number, bone.numpy(), region.spacing)
+    edge = _threshold(brightest, _EDGE_SHARE, _LOWEST_EDGE_HU, _HIGHEST_EDGE_HU)
+    settled = _is_bone(bone, region, edge) | (joint > _JOINT_SHARE)
+    found = _trimmed(found, settled.numpy(), region.spacing)
     found = opened_joints(found, region.hu.numpy(), region.spacing, anatomy)
     return _onto(labels, torch.from_numpy(found), region)
 
@@ -143,17 +153,31 @@ def _linear(values: Tensor, places: Tensor, axis: int) -> Tensor:
     return first + share * (values.index_select(axis, above) - first)
 
 
-def _is_bone(bone: Tensor, region: _Region) -> Tensor:
-    """Where the network's share of bone and the CT's edges together say bone (Z, Y, X)."""
-    hu = region.hu
-    near = _radius(_NEAR_MM, region.spacing)
-    brightest = _largest_near(hu.clamp(-200, 1500), near)
-    edge = (_SOFT_HU + _EDGE_SHARE * (brightest - _SOFT_HU)).clamp(_LOWEST_EDGE_HU, _HIGHEST_EDGE_HU)
-    evidence = ((hu - edge) / _SOFTNESS_HU).clamp(-1, 1)
-    metal = hu > _METAL_HU
+def _threshold(brightest: Tensor, share: float, lowest: float, highest: float) -> Tensor:
+    """HU above which a voxel is bone, from the brightest bone near it."""
+    return (_SOFT_HU + share * (brightest - _SOFT_HU)).clamp(lowest, highest)
+
+
+def _is_bone(bone: Tensor, region: _Region, threshold: Tensor) -> Tensor:
+    """Where the network's share of bone and the CT together say bone (Z, Y, X)."""
+    evidence = ((region.hu - threshold) / _SOFTNESS_HU).clamp(-1, 1)
+    metal = region.hu > _METAL_HU
     if bool(metal.any()):
         evidence[_largest_near(metal.float(), _radius(_METAL_MM, region.spacing)) > 0] = 0
     return (bone - 0.5) + _CT_WEIGHT * evidence > 0
+
+
+def _trimmed(labels: NDArray[np.uint8], settled: Mask, spacing: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """The labels, `_RIM_MM` deep from outside, without what is not `settled`, which keeps what lies behind it."""
+    layers = _radius(_RIM_MM, spacing)
+    outside, may_be = labels == 0, (labels == 0) | ~settled
+    for n in range(max(layers)):
+        step = ndimage.generate_binary_structure(3, 1)
+        for axis, most in enumerate(layers):
+            if n >= most:  # deep enough along the longer edges of voxels
+                step.swapaxes(0, axis)[[0, 2]] = False
+        outside = ndimage.binary_dilation(outside, step, mask=may_be)
+    return np.where(outside, 0, labels).astype(np.uint8)
 
 
 def _radius(mm: float, spacing: NDArray[np.float64]) -> tuple[int, int, int]:
@@ -233,6 +257,9 @@ def opened_joints(
         markers = np.zeros(part.shape, np.int32)
         for number, other in ((femur, hip), (hip, femur)):
             markers[(part == number) & ~(ndimage.maximum_filter(part == other, size))] = number
+        rim = np.ones(part.shape, bool)
+        rim[1:-1, 1:-1, 1:-1] = False  # beyond it nothing changes, so that nothing may change on it
+        markers[rim & both] = part[rim & both]
         fine = bool(spacing.max() <= _LINE_MM)
         smooth = ndimage.gaussian_filter(hu[box], _VALLEY_MM / spacing[::-1])
         apart = watershed(-smooth, markers, mask=both, watershed_line=fine)
