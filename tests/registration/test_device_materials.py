@@ -11,7 +11,8 @@ import trimesh
 from femoreg_torch.case import Start
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import CArm, Poses, about_point, centred_camera, exp_se3, pose_difference, rigid
-from femoreg_torch.registration.calibration import Calibration, fit_device
+from femoreg_torch.registration.calibration import Calibration
+from femoreg_torch.registration.device_fit import fit_device
 from femoreg_torch.registration.regions import (
     blocks_of,
     materials,

@@ -1,0 +1,218 @@
+"""The shadows of a device in images with and without it, as a function of what it is made of, its pose, and scatter.
+
+Images without and with a device are taken from one C-arm pose, so that all but the device is the same in both. Let Iₐ
+and I_d be their intensities and S the light that is scattered into a pixel; then
+
+    I_d = g · ((Iₐ − S) · (1 + h Σ a ℓ)^(−1/h) + S)
+
+with the path ℓ through each region of the device, its attenuation a where it is thin, a factor g between the exposures,
+and the hardening h of the beam in it (`registration.imaging.hardened`). The additive scatter is that of Seibert and
+Boone, X-ray scatter removal by deconvolution, Med Phys 15 (1988) 567. Where metal is opaque the shadow is S, whatever
+the metal, so that its darkest places tell S, and lighter ones the attenuation. This least squares is sparse and runs on
+the CPU, with SciPy, wherever the scene lies.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from scipy.sparse import csr_array
+from torch import Tensor
+
+from femoreg_torch.cores import on_all_cores
+from femoreg_torch.drr import project_with_jacobian
+from femoreg_torch.geometry import Camera, Poses, transform_points
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.regions import Doubles, Indices, RegionVoxels, region_paths, region_voxels
+from femoreg_torch.registration.scene import Kind, Scene
+from femoreg_torch.registration.weights import dilated
+from femoreg_torch.volume import Volume
+
+LEVEL = Level(pixel_mm=1.55, step_mm=0.5)
+LEAST_PIXELS = 100  # of a view that counts
+TWIST = np.array([0.01] * 3 + [1.0] * 3)  # rad and mm: one unit of the pose
+# Squared coefficient of variation of metal's attenuation over the spectrum of a tube at 75 kV, behind 200 mm of water:
+# 0.35, by the tables of `volume.materials`, 0.22 at 60 kV and 0.5 at 100 kV. Thick metal, which lets the hardest light
+# through, hardens the beam by less than the law of `hardened` says: 5 mm of steel as if it were 0.1. Between the two.
+HARDENING = 0.2
+_LEAST_PATH_MM = 0.3  # of a ray through the device, for its pixel to count
+_AROUND_MM = 3.0  # on the detector: pixels beyond the shadow that count, so that the device may move
+_FAINTEST = 1e-3  # 1/mm
+_MOST_ATTENUATION = 2.5  # 1/mm: steel at 45 keV, of which 2 mm are opaque
+_VARIATION = 5.0  # weight of a step of 1/mm between all blocks
+_FLAT = 0.01  # 1/mm: steps that are none
+_TOLD_WITHIN = 0.3  # deviation of the logarithm of what a named material attenuates; nobody tells the tube's voltage
+_TOLD_WEIGHT = 1 / 200  # of one named material beside all pixels, whose misfits are alike over wide regions
+_MISFIT = 0.05  # of a logarithm of intensity; larger ones (something else has changed) count less
+_LEAST_PASSING = 1e-3  # of 1 + h Σ a ℓ, where a motion of the device takes its path below nothing
+_CORNERS = 4  # of the box around the device: scattered light is interpolated between them
+
+
+@dataclass(frozen=True, eq=False)
+class Device:
+    """A device in regions, each of one attenuation."""
+
+    name: str
+    kind: Kind  # of the images that show it
+    share: Volume  # of every voxel that is inside
+    owner: Tensor  # (Z, Y, X): the region of every voxel, −1 where it is empty
+    regions: int
+    voxels: RegionVoxels
+    touching: Indices | None  # (n, 3): pairs of regions, and the faces between them
+    told: Doubles | None  # (regions,) attenuations that the case names
+
+    def filled(self, attenuation: Doubles) -> Volume:
+        """Its attenuation, 1/mm, from that of its regions."""
+        of_voxel = torch.from_numpy(np.append(attenuation, 0.0)).float()[self.owner]
+        return self.share.with_data(self.share.data * of_voxel)
+
+
+def device_of(
+    name: str,
+    kind: Kind,
+    share: Volume,
+    owner: Tensor,
+    regions: int,
+    touching: Indices | None = None,
+    told: Doubles | None = None,
+) -> Device:
+    return Device(name, kind, share, owner, regions, region_voxels(share, owner, regions), touching, told)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The pixels of one view that the device covers, and those around."""
+
+    view: int
+    pixels: Indices  # (N,) of the image of `LEVEL`
+    paths: csr_array  # (N, K) mm through each region
+    changes: Doubles  # (N, 6) of the path · attenuation by a twist, in units of `TWIST`
+    without: Doubles  # (N,) intensities
+    with_it: Doubles
+    corners: Doubles  # (N, 4): share of each corner of the box around the device
+
+
+def views_of(
+    scene: Scene, poses: Poses, device: Device, chosen_views: list[int] | None = None, volume: Volume | None = None
+) -> list[View]:
+    """What views with both images show of a device, by default those that show enough of it.
+
+    With its `volume` they tell how their image changes as the device moves.
+    """
+
+    def look(view: int) -> View | None:
+        camera = poses.camera(view, LEVEL.camera(scene.carm.camera))
+        pose = poses.camera_from(device.name)[view]
+        paths = region_paths(device.voxels, pose, camera)
+        covered = torch.from_numpy(paths.sum(1)).reshape(camera.shape) > _LEAST_PATH_MM
+        if volume is not None:
+            covered = dilated(covered, _AROUND_MM, camera)
+        intensities = []
+        for k in (scene.first_kind, device.kind):
+            image = LEVEL.image(scene.image(k, view), scene.carm.camera)
+            intensities.append((-image.cpu()).exp().flatten().double().numpy())
+            field = scene.field(k, view)
+            if field is not None:
+                covered &= LEVEL.field(field, scene.carm.camera).cpu()
+        chosen = np.flatnonzero(covered.flatten().numpy())
+        changes = np.zeros((len(chosen), 6))
+        if volume is not None:
+            centre = transform_points(pose, scene.objects[device.name].reference_point[None])[0]
+            _, jacobian = project_with_jacobian(volume, pose[None], camera, centre, LEVEL.step_mm)
+            turn = torch.block_diag(*[poses.camera_from_camera1[view][:3, :3]] * 2)  # twists of camera 1 to this one's
+            changes = (jacobian[0].flatten(0, 1)[chosen].double() @ turn).numpy() * TWIST
+        if chosen_views is None and len(chosen) < LEAST_PIXELS:
+            return None
+        without, with_it = (values[chosen] for values in intensities)
+        return View(view, chosen, paths[chosen], changes, without, with_it, _corners(chosen, camera))
+
+    there = [view for _, view in scene.there([device.kind], range(scene.views))]
+    asked = [view for view in there if chosen_views is None or view in chosen_views]
+    return [view for view in on_all_cores(look, asked, scene.device) if view is not None]
+
+
+def first_guess(seen: list[View], attenuation: Doubles) -> Doubles:
+    """Parameters, see `solve`, with these attenuations, and scatter that leaves the darkest pixels some light."""
+    scatter = np.repeat([0.7 * _darkest(view) for view in seen], _CORNERS)
+    return np.concatenate([attenuation, scatter, np.zeros(len(seen) + 6)])
+
+
+def _darkest(view: View) -> float:
+    """Nearly the darkest intensity behind the device."""
+    return float(np.quantile(view.with_it, 0.03)) if len(view.with_it) else 1.0
+
+
+def solve(seen: list[View], device: Device, begin: Doubles, iterations: int) -> tuple[Doubles, int]:
+    """Attenuations (K), scattered light (4 V), log factors between the exposures (V), a twist (6); and evaluations.
+
+    Least squares of the logarithms of intensity, robust, plus, over the faces between `touching` regions, the total
+    variation of the attenuation, as a device is of few materials (Rudin, Osher, Fatemi, Physica D 60 (1992) 259), and
+    how far the attenuations are from those that the case names.
+    """
+    views, regions, touching = len(seen), device.regions, device.touching
+    darkest = np.repeat([_darkest(view) for view in seen], _CORNERS)
+    unit = np.concatenate([np.ones(regions), darkest, np.ones(views + 6)])
+    highest = np.concatenate([np.full(regions, _MOST_ATTENUATION), np.inf * darkest, np.full(views, 0.5), [3.0] * 6])
+    lowest = np.concatenate([np.zeros(regions + len(darkest)), -highest[-views - 6 :]])
+    count = max(1, sum(len(view.with_it) for view in seen))
+
+    def cost(y: Doubles) -> tuple[float, Doubles]:
+        x = y * unit
+        value, slope = 0.0, np.zeros_like(x)
+        for n, view in enumerate(seen):
+            residual, by_path, by_scatter = residuals(x, seen, n, regions)
+            root = np.sqrt(1 + (residual / _MISFIT) ** 2)
+            value += (root - 1).sum() / count
+            push = residual / root / (_MISFIT**2 * count)
+            slope[:regions] += view.paths.T @ (push * by_path)
+            slope[scatter_of(n, regions)] += (push * by_scatter) @ view.corners
+            slope[regions + _CORNERS * views + n] -= push.sum()
+            slope[-6:] += (push * by_path) @ view.changes
+        if touching is not None and len(touching):
+            one, other, faces = touching.T
+            step = x[one] - x[other]
+            soft = np.sqrt(step**2 + _FLAT**2)
+            share = _VARIATION * faces / faces.sum()
+            value += (share * (soft - _FLAT)).sum()
+            np.add.at(slope, one, share * step / soft)
+            np.add.at(slope, other, -share * step / soft)
+        if device.told is not None:
+            off = np.log(np.maximum(x[:regions], _FAINTEST) / device.told) / _TOLD_WITHIN
+            value += 0.5 * _TOLD_WEIGHT * (off**2).sum()
+            slope[:regions] += _TOLD_WEIGHT * off / (_TOLD_WITHIN * np.maximum(x[:regions], _FAINTEST))
+        return value, slope * unit
+
+    bounds = list(zip(lowest / unit, highest / unit, strict=True))
+    options = {"maxiter": iterations}
+    found = minimize(cost, begin / unit, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return np.asarray(found.x) * unit, int(found.nfev)
+
+
+def scatter_of(n: int, regions: int) -> slice:
+    """Where the scattered light of view n stands among the parameters."""
+    return slice(regions + _CORNERS * n, regions + _CORNERS * (n + 1))
+
+
+def _corners(pixels: Indices, camera: Camera) -> Doubles:
+    """Shares (N, 4) of the corners of the box around pixels, by bilinear interpolation."""
+    if not len(pixels):
+        return np.zeros((0, _CORNERS))
+    rows, columns = np.divmod(pixels, camera.shape[1])
+    u = (columns - columns.min()) / max(1, np.ptp(columns))
+    v = (rows - rows.min()) / max(1, np.ptp(rows))
+    return np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], 1)
+
+
+def residuals(x: Doubles, seen: list[View], n: int, regions: int) -> tuple[Doubles, Doubles, Doubles]:
+    """Differences of the logarithms of intensity (N,) of view n, and their derivatives by Σ a ℓ and by S."""
+    view = seen[n]
+    gain = x[regions + _CORNERS * len(seen) + n]
+    scatter = view.corners @ x[scatter_of(n, regions)]
+    integrals = view.paths @ x[:regions] + view.changes @ x[-6:]
+    passing = np.maximum(1 + HARDENING * integrals, _LEAST_PASSING)
+    light = passing ** (-1 / HARDENING)
+    primary = np.maximum(view.without - scatter, 1e-3 * view.without)
+    total = primary * light + scatter
+    by_path = primary * light / passing / total
+    return np.log(view.with_it) - gain - np.log(total), by_path, -(1 - light) / total
