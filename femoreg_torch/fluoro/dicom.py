@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from femoreg_torch.arrays import check_pixels, quiet
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro.tags import Tags, find_value, read_tags
+from femoreg_torch.fluoro.tags import Tags, find_value, read_tags, value_in
 
 Frames = tuple[int, ...] | Literal["mean"]  # of a cine run: numbers from 1, averaged, or all of them
 Values = NDArray[Any]
@@ -24,6 +24,12 @@ _PIXEL_TAGS = (
     "PlanarConfiguration", "Rows", "Columns", "BitsAllocated", "BitsStored", "HighBit", "PixelRepresentation",
     "PixelData",
 )  # fmt: skip
+_SECONDARY_CAPTURES = "1.2.840.10008.5.1.4.1.1.7"  # what their SOP classes begin with
+_SAME_DEG = 0.5  # between frames of an arm that stands still
+SCREEN = (
+    "is a picture of a screen: 8 bits, with a window and a curve that nobody knows. Take the DICOM file of the C-arm "
+    "itself where there is one"
+)
 _RADIOGRAPHS = ("CR", "DX")  # which are shown with bone bright, where fluoroscopy has it dark
 
 
@@ -101,8 +107,13 @@ def read_dicom(path: Path, frames: Frames | None) -> DicomImage:
 def _read(path: Path, frames: Frames | None) -> DicomImage:
     dataset = _dataset(path)
     check_pixels(path, int(dataset.get("Rows") or 1), int(dataset.get("Columns") or 1))
+    if dataset.get("PhotometricInterpretation") == "PALETTE COLOR":
+        raise InputError(f"{path}: a colour image, but fluoroscopy has one value per pixel. Export it as greyscale.")
+    numbers = _numbers(dataset, frames, path)
+    _keep_groups(dataset, numbers, path)
     tags = _tags(dataset, path)
-    stored = _pixels(dataset, _numbers(dataset, frames, path))
+    stored = _pixels(dataset, numbers)
+    of_a_screen = stored.ndim == 3 or str(dataset.get("SOPClassUID")).startswith(_SECONDARY_CAPTURES)
     if stored.ndim == 3 and stored.shape[-1] == 3:
         if (stored != stored[..., :1]).any():
             return DicomImage(stored, tags, None, None, (), None)  # refused by its shape
@@ -114,7 +125,7 @@ def _read(path: Path, frames: Frames | None) -> DicomImage:
     inverted = sign == -1 if sign is not None else dataset.get("PhotometricInterpretation") == "MONOCHROME1"
     if inverted and not linear:  # a LUT to linear values says itself which are high
         values = lowest + highest - values
-    remarks: list[str] = []
+    remarks = [SCREEN] if of_a_screen and int(dataset.get("BitsStored", 16)) <= 8 else []
     asks: str | None = None
     intensity: Literal["raw", "log"] | None = None
     if relation == "LIN" or linear:
@@ -149,6 +160,20 @@ def _numbers(dataset: Any, frames: Frames | None, path: Path) -> tuple[int, ...]
     if len(chosen) > 1 and dataset.get("PositionerMotion") == "DYNAMIC":
         raise InputError(f"{path}: the C-arm moved during this run, so frames cannot be averaged. Name one frame.")
     return tuple(n - 1 for n in chosen)
+
+
+def _keep_groups(dataset: Any, numbers: tuple[int, ...], path: Path) -> None:
+    """Leave what an enhanced image says of each frame to those that are meant. Raises `InputError` if the arm moved."""
+    groups = dataset.get("PerFrameFunctionalGroupsSequence")
+    if not groups:
+        return
+    meant = [groups[n] for n in numbers if n < len(groups)]
+    for keyword in ("PositionerPrimaryAngle", "PositionerIsocenterPrimaryAngle"):
+        told = (value_in(group, keyword) for group in meant)
+        angles = [float(angle) for angle in told if angle is not None]
+        if angles and max(angles) - min(angles) > _SAME_DEG:
+            raise InputError(f"{path}: the C-arm moved between these frames, so they cannot be averaged. Name one.")
+    dataset.PerFrameFunctionalGroupsSequence = meant
 
 
 def _pixels(dataset: Any, frames: tuple[int, ...]) -> Values:
@@ -194,7 +219,8 @@ def _stored_bits(dataset: Any, pixels: Values) -> Values:
     shift, width = high + 1 - stored, 8 * pixels.dtype.itemsize
     if shift < 0 or stored > width or (shift == 0 and stored == width):
         return pixels
-    bits = (pixels.view(f"u{pixels.dtype.itemsize}").astype(np.int64) >> shift) & (2**stored - 1)
+    native = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)  # of a file in big endian
+    bits = (native.view(f"u{pixels.dtype.itemsize}").astype(np.int64) >> shift) & (2**stored - 1)
     if dataset.PixelRepresentation:
         bits = np.where(bits >= 2 ** (stored - 1), bits - 2**stored, bits)
     return bits
@@ -221,9 +247,11 @@ def _after_modality(dataset: Any, stored: Values, relation: str) -> tuple[Values
     bits = int(dataset.get("BitsStored", 16))
     lowest = -(2 ** (bits - 1)) if dataset.get("PixelRepresentation") else 0
     ends = np.array([lowest, lowest + 2**bits - 1])
-    for keyword in ("RescaleSlope", "RescaleIntercept"):  # of enhanced images
-        if keyword not in dataset and (value := find_value(dataset, keyword)) is not None:
-            setattr(dataset, keyword, value)
+    for keyword in ("RescaleSlope", "RescaleIntercept"):
+        if dataset.get(keyword) is None:  # left empty, or that of an enhanced image
+            setattr(dataset, keyword, find_value(dataset, keyword))
+    if dataset.RescaleSlope is None or dataset.RescaleIntercept is None:
+        del dataset.RescaleSlope, dataset.RescaleIntercept
     for item in find_value(dataset, "PixelIntensityRelationshipLUTSequence") or ():
         if item.get("LUTFunction") == "TO_LINEAR":
             dataset.ModalityLUTSequence = [item]  # in place of what the file has for display

@@ -14,24 +14,22 @@ from torch import Tensor
 from femoreg_torch.arrays import MOST_PIXELS, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
-from femoreg_torch.fluoro.dicom import DicomImage, Frames, read_dicom, read_header
+from femoreg_torch.fluoro.dicom import SCREEN, DicomImage, Frames, read_dicom, read_header
 from femoreg_torch.fluoro.png import chunks_are_there
 from femoreg_torch.fluoro.tags import Tags
 from femoreg_torch.geometry import Camera
+from femoreg_torch.pictures import write_picture
 from femoreg_torch.text import read_bytes
 from femoreg_torch.volume.dicom import is_dicom
 from femoreg_torch.volume.itk import read_itk
 
 _ITK_SUFFIXES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
+_PAGED_SUFFIXES = (".tif", ".tiff")
 _SCREEN_SUFFIXES = (".jpg", ".jpeg", ".bmp")  # what nobody stores intensities in
 _LOG_RANGE = (2.0, 20.0)  # of the greatest attenuation in an image: 45 cm of water at 60 keV are 9
 _MOST_PICTURE_BYTES = 2**28  # what the most pixels have as floats
 _GREY_STEPS = 12  # by which the colours of a grey JPEG may differ
-_SCREEN = (
-    "is a picture of a screen: 8 bits, with a window and a curve that nobody knows. Take the DICOM file where there "
-    "is one"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +46,14 @@ class StoredImage:
 
 def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     content = read_bytes(path, _MOST_PICTURE_BYTES)
-    image = None
+    image, pages = None, 1
     if content and chunks_are_there(content):
         with suppress(cv2.error, MemoryError), quiet():  # of more pixels than OpenCV was told to allow
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+            if image is not None and path.suffix.lower() in _PAGED_SUFFIXES:
+                pages = cv2.imcount(str(path))
+    if pages > 1:
+        raise InputError(f"{path}: holds {pages} pictures, one was expected. Save each as a file of its own.")
     if image is None:
         raise InputError(
             f"{path}: cannot be read as a PNG, TIFF or JPEG image of at most {MOST_PIXELS} pixels; the file is damaged "
@@ -62,7 +64,7 @@ def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
         colours = image[..., :3].astype(np.int64)
         if np.ptp(colours, axis=-1).max() <= (_GREY_STEPS if path.suffix.lower() in _SCREEN_SUFFIXES else 0):
             image, screen = image[..., 1], True
-    return image, (_SCREEN,) if screen else ()
+    return image, (SCREEN,) if screen else ()
 
 
 def _read_itk(path: Path) -> np.ndarray:
@@ -153,10 +155,7 @@ def write_image(path: Path, image: Tensor) -> None:
     if image.dtype != torch.uint16 or image.ndim != 2 or path.suffix.lower() not in _PICTURE_SUFFIXES:
         raise InputError(f"{path}: a (H, W) uint16 image and a name in {', '.join(_PICTURE_SUFFIXES)} were expected.")
     with temporary_file(path) as part:
-        with quiet():
-            written = cv2.imwrite(str(part), image.numpy())
-        if not written:
-            raise OSError(f"{path}: the image could not be written.")
+        write_picture(part, image.numpy())
 
 
 def check_matches(image: Tensor, camera: Camera, where: str) -> None:

@@ -89,12 +89,19 @@ def find_value(dataset: Any, keyword: str) -> Any:
         return value
     for groups in ("SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence"):
         for item in (dataset.get(groups) or [])[:1]:
-            for element in item:
-                if element.keyword == keyword:
-                    return element.value
-                for inner in element.value if element.VR == "SQ" else ():
-                    if inner.get(keyword) is not None:
-                        return inner.get(keyword)
+            if (value := value_in(item, keyword)) is not None:
+                return value
+    return None
+
+
+def value_in(group: Any, keyword: str) -> Any:
+    """A value of one item of functional groups, its own or one of its sequences', or None."""
+    for element in group:
+        if element.keyword == keyword:
+            return element.value
+        for inner in element.value if element.VR == "SQ" else ():
+            if inner.get(keyword) is not None:
+                return inner.get(keyword)
     return None
 
 

@@ -81,7 +81,8 @@ def check_case(folder: Path, find_start: bool = True, landmarks: Mapping[str, Te
     if case is not None and case.views and find_start and not found.problems:
         start = found.attempt(lambda: picture_of_start(case, landmarks))
         if start is not None:
-            found.facts += start.facts
+            found.facts += [fact for fact in start.facts if fact not in found.warnings]
+            found.warnings += start.warnings
             below = start.picture
     picture = stacked(planes_of(seen, case), below)
     return Checked(tuple(found.problems), tuple(found.warnings), tuple(found.facts), picture)

@@ -42,6 +42,8 @@ _MESHES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb", ".step", ".stp")
 _POINTS = (".fcsv", ".json")
 _TRANSFORMS = (".tfm", ".h5", ".mat")
 _PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+_LISTED = 40  # entries of a folder
+_ALONE = (SEGMENTATION_SUFFIX, ".mrk.json", ".fcsv", *_MESHES, *_TRANSFORMS)  # not found among masks of bones
 _TINTS = (
     (255, 90, 60),
     (60, 160, 255),
@@ -90,13 +92,20 @@ def inspect_path(path: Path, series: str | None = None) -> Findings:
 
 
 def _folder(path: Path, series: str | None) -> Findings:
-    if (path / "case.yaml").is_file():
+    kind = _kind_of(path)
+    if kind == "case":
         return _case(path)
-    if any(entry.name.lower().endswith(_VOLUMES) for entry in path.iterdir()):
+    if kind == "masks of bones":
         return _segmentation(path)
+    if kind in ("several things", "images"):
+        entries = _entries(path)
+        facts = [_in_short(entry) for entry in entries[:_LISTED]]
+        if len(entries) > _LISTED:
+            facts.append(f"and {len(entries) - _LISTED} more")
+        return Findings(f"folder of {kind}", tuple(facts))
     there = series_in(path)
     if not there:
-        raise InputError(f"{path}: holds no case.yaml, no DICOM files and no masks of bones.")
+        raise InputError(f"{path}: holds no case.yaml, no DICOM files, no images and no masks of bones.")
     facts = [one.told for one in there]
     volumes = [one for one in there if one.may_be_volume]
     if series is None and len(volumes) != 1:
@@ -106,6 +115,38 @@ def _folder(path: Path, series: str | None) -> Findings:
         return Findings("DICOM folder", (*facts, hint))
     found = _volume(path, series)
     return Findings("DICOM folder", (*facts, *found.facts), found.warnings, found.picture)
+
+
+def _entries(folder: Path) -> list[Path]:
+    return sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+
+
+def _kind_of(folder: Path) -> str:
+    """What a folder is, by the names in it."""
+    if (folder / "case.yaml").is_file():
+        return "case"
+    names = [entry.name.lower() for entry in _entries(folder)]
+    if any(name.endswith(_ALONE) for name in names):
+        return "several things"
+    if any(name.endswith(_VOLUMES) for name in names):
+        return "masks of bones"
+    if names and all(name.endswith(_PICTURES) for name in names):
+        return "images"
+    return "DICOM files"
+
+
+def _in_short(entry: Path) -> str:
+    """One line on what stands in a folder beside other things."""
+    if entry.is_dir():
+        kind = _kind_of(entry)
+        if kind == "DICOM files":
+            return f"{entry.name}: folder, {'; '.join(one.told for one in series_in(entry)) or 'nothing known here'}"
+        return f"{entry.name}: {'' if kind == 'case' else 'folder of '}{kind}"
+    try:
+        found = inspect_path(entry)
+    except InputError as error:
+        return f"{entry.name}: {str(error).removeprefix(f'{entry}: ').rstrip('.')}"
+    return f"{entry.name}: {found.kind}, {found.facts[0].rstrip(':')}"
 
 
 def _dicom_file(path: Path) -> Findings:
@@ -171,7 +212,10 @@ def _labels(volume: Volume, names: Mapping[str, tuple[int, ...]], path: Path, wa
         fitting = fitting_tables(ids)
         facts.append(f"shipped tables whose hip bones and femora are there: {', '.join(fitting) or 'none'}")
     whole = Volume(data, volume.lps_from_index)
-    warnings += cut_bones(whole, table, list(table))
+    if path.name.lower().endswith(SEGMENTATION_SUFFIX):
+        facts.append("3D Slicer saves the box of the segments alone; `femoreg check` tells which bones the CT cuts")
+    else:
+        warnings += cut_bones(whole, table, list(table))
     tints = {n: HIP.bone(b).colour for b, n in table.items() if b in HIP.bone_names}
     colours = {n: tints.get(n, _TINTS[k % len(_TINTS)]) for k, n in enumerate(ids)}
     return Findings("label map", tuple(facts), tuple(warnings), three_planes(None, whole, colours, {}))
@@ -180,12 +224,13 @@ def _labels(volume: Volume, names: Mapping[str, tuple[int, ...]], path: Path, wa
 def _points(path: Path) -> Findings:
     points = read_landmarks(path, None)
     facts = [f"{name}: ({', '.join(f'{v:.2f}' for v in point.tolist())}) mm LPS" for name, point in points.items()]
-    warnings: list[str] = []
+    if not points.keys() & set(HIP.landmark_names):
+        facts.append(f"none of these names is one of the landmarks {', '.join(HIP.landmark_names)}")
+        return Findings("points", tuple(facts))
     try:
         marks = read_landmarks(path)
     except InputError as error:
-        warnings.append(f"not a file of landmarks alone: {error}")
-        return Findings("points", tuple(facts), tuple(warnings))
+        return Findings("points", tuple(facts), (f"not a file of landmarks alone: {str(error).rstrip('.')}",))
     missing = [name for name in HIP.landmark_names if name not in marks]
     if missing:
         facts.append(f"without {', '.join(missing)}")

@@ -306,7 +306,8 @@ def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
         return content | {f"{FEMUR}_from_{DEVICE}": read_itk_transform(given.device_transform)}
     place = NominalPlace(given.guide or ALONG_PATH, given.before_entry_mm, given.turned_deg, given.in_front_mm)
     if given.guide is None:
-        notes.append(f"the device starts {ALONG_PATH}, its tip {given.before_entry_mm:g} mm before the entry point")
+        mm, where = abs(given.before_entry_mm), "past" if given.before_entry_mm < 0 else "before"
+        notes.append(f"the device starts {ALONG_PATH}, its tip {mm:g} mm {where} the entry point")
     return content | {"start": vars(place)}
 
 

@@ -1,6 +1,6 @@
 """The bones at the start pose over the first view, sides named, and the device where it is meant to stand."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -21,6 +21,7 @@ from femoreg_torch.registration.start import look_at, start_by_detection, start_
 
 _WIDTH_PX = 560
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+_LEAST_SHOWN = 0.25  # of a model: with less, a device may be seen by its round guide alone
 _YELLOW, _MAGENTA, _WHITE = (60, 230, 255), (255, 60, 255), (255, 255, 255)
 
 
@@ -30,6 +31,7 @@ class StartPicture:
 
     picture: Picture
     facts: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def picture_of_start(case: Case, landmarks: Mapping[str, Tensor] | None = None) -> StartPicture:
@@ -46,7 +48,29 @@ def picture_of_start(case: Case, landmarks: Mapping[str, Tensor] | None = None) 
         facts.append(f"start: {record.source}, {used} landmarks within {record.reprojection_rms_px:.1f} pixels")
     poses = scene.start(None if record is None else record.camera1_from_object)
     panels = [_panel(case, scene, poses, kind) for kind in scene.images if scene.images[kind][0] is not None]
-    return StartPicture(np.hstack(panels), tuple(facts))
+    models = [name for name, thing in case.objects.items() if thing.model is not None]
+    return StartPicture(np.hstack(panels), tuple(facts), hardly_shown(scene, poses, models))
+
+
+def hardly_shown(scene: Scene, poses: Poses, names: Sequence[str]) -> tuple[str, ...]:
+    """Which of the named objects lie in the first view with less than a quarter of their volume, in words."""
+    found = []
+    for name in names:
+        if name not in poses.camera1_from:
+            continue
+        volume = scene.objects[name].volume
+        inside = (volume.data > volume.data.max() / 2).nonzero().cpu().flip(1).double()
+        points = transform_points(poses.camera_from(name)[0] @ volume.lps_from_index, inside)
+        rows, columns = scene.carm.camera.shape
+        pixels = project_points(scene.carm.camera, points)
+        last = pixels.new_tensor([columns - 1, rows - 1])
+        share = float(((pixels >= 0) & (pixels <= last)).all(1).double().mean())
+        if share < _LEAST_SHOWN:
+            found.append(
+                f"{name}: where it is meant to stand, {share:.0%} of it lies in the picture of view 1. If the images "
+                "show no more, its turn about a round guide stays open: take views that show more of it"
+            )
+    return tuple(found)
 
 
 def _panel(case: Case, scene: Scene, poses: Poses, kind: str) -> Picture:

@@ -1,5 +1,6 @@
 """The start pose: landmarks in view 1, PnP (paper, section II-A), and then the outlines of the bones."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,7 +11,7 @@ from femoreg_torch.anatomy import HIP, Anatomy
 from femoreg_torch.case import Case, LandmarkRecord, StartRecord
 from femoreg_torch.detect import Detection, as_stored, filled, within_field
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import Display
+from femoreg_torch.fluoro import SOURCES, Display
 from femoreg_torch.geometry import Camera, transform_points
 from femoreg_torch.pnp import FRONT_TO_BACK, MINIMUM, PnpResult, solve_pnp
 from femoreg_torch.registration.prepare import view_distortion
@@ -31,6 +32,7 @@ _OF_A_SIDE = (
     "This view is taken from a side, and the shipped network knows views from the front and from behind: pick the "
     "landmarks in the image (--landmarks), or put another view first."
 )
+_MOST_ASKEW_DEG = 60.0  # of the beam against the side that the case says; beyond 45° another side is nearer
 GIVEN_DEVIATION_MM = 1.5  # on the detector, along each axis: of landmarks that a person picked in the image
 
 
@@ -70,7 +72,8 @@ def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) ->
     Pixels are those of the image as it is stored.
 
     Raises `InputError` if fewer than four have a name that the case knows, fewer than four agree, they leave the
-    rotation open by more than 5°, or, in a view from a side, they may be those of the other side.
+    rotation open by more than 5°, they tell another side of the source than the case, or, in a view from a side, they
+    may be those of the other side.
     """
     names = [name for name in pixels if name in case.landmarks]
     if len(names) < MINIMUM:
@@ -96,7 +99,9 @@ def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) ->
 
     pnp = fitted(names, seen)
     _check_rotation(pnp)
-    if display.source in ("left", "right") and case.anatomy is not None:
+    _check_beam(pnp.camera_from_object, display)
+    left, back, _ = pnp.camera_from_object[2, :3].abs().tolist()
+    if left > back and case.anatomy is not None:
         _check_sides(case.anatomy, case.landmarks, names, seen, fitted)
     marks = {
         name: LandmarkRecord(_pair(pixels[name]), 1.0, True, inlier)
@@ -166,6 +171,19 @@ def _check_rotation(pnp: PnpResult) -> None:
             f"too few usable landmarks: {int(pnp.inliers.sum())} of {len(pnp.inliers)} agree, but they fix the "
             f"rotation only to {pnp.rotation_deviation_deg:.0f}°, and no outlines help. Take a view that shows more "
             "landmarks, give more of them by hand (--landmarks), or name the bones of the label map under `ct.bones`."
+        )
+
+
+def _check_beam(camera_from_ct: Tensor, display: Display) -> None:
+    """Raises `InputError` where landmarks tell another side of the source than the case does."""
+    beam = camera_from_ct[2, :3]
+    off = math.degrees(math.acos(float((beam @ beam.new_tensor(display.beam)).clamp(-1, 1))))
+    nearest = max(SOURCES, key=lambda source: float(beam @ beam.new_tensor(Display(source).beam)))
+    if off > _MOST_ASKEW_DEG and nearest != display.source:  # steep views of the same side are right
+        raise InputError(
+            f"landmarks in the image: by them the source stands {off:.0f}° from the patient's {display.source} side, "
+            f"which the case says, and nearest to the {nearest} one. Write `display: {{source: {nearest}}}`, and see "
+            "whether `mirrored` is right, or look at the landmarks again."
         )
 
 

@@ -7,7 +7,12 @@ import pydicom
 import pytest
 import SimpleITK as sitk
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
-from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
+from pydicom.uid import (
+    ExplicitVRBigEndian,
+    ExplicitVRLittleEndian,
+    SecondaryCaptureImageStorage,
+    XRayAngiographicImageStorage,
+)
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import (
@@ -194,6 +199,58 @@ def test_an_enhanced_image_says_in_its_groups_what_its_values_are(tmp_path: Path
     read = read_stored(write(tmp_path, NumberOfFrames=1, SharedFunctionalGroupsSequence=[shared]))
     np.testing.assert_array_equal(read.values.numpy(), 3 * PIXELS.astype(int))
     assert read.intensity == "raw"
+
+
+def group(**values: object) -> Dataset:
+    item = Dataset()
+    for name, value in values.items():
+        setattr(item, name, value)
+    return item
+
+
+def test_an_enhanced_run_says_of_each_frame_where_the_arm_stood(tmp_path: Path) -> None:
+    frames = [
+        group(
+            XRayGeometrySequence=[group(DistanceSourceToDetector=1000 + 5 * n)],
+            PositionerPositionSequence=[group(PositionerPrimaryAngle=30 * n)],
+        )
+        for n in (0, 0, 1)
+    ]
+    path = write(tmp_path, np.stack([PIXELS] * 3), NumberOfFrames=3, PerFrameFunctionalGroupsSequence=frames)
+    for number, sdd, source in ((1, 1000, 180), (3, 1005, 210)):
+        tags = read_stored(path, (number,)).tags
+        assert tags is not None
+        assert (tags.sdd_mm, tags.source_deg) == (sdd, source)
+    np.testing.assert_array_equal(values(path, frames=(1, 2)), PIXELS)
+    for moved in ((1, 3), "mean"):
+        with pytest.raises(InputError, match="the C-arm moved between these frames"):
+            values(path, frames=moved)
+
+
+def test_big_endian_and_an_empty_rescale(tmp_path: Path) -> None:
+    np.testing.assert_array_equal(values(write(tmp_path, RescaleSlope=None, RescaleIntercept=None)), PIXELS)
+    path = write(tmp_path)
+    dataset = pydicom.dcmread(path)
+    dataset.PixelData = PIXELS.astype(">u2").tobytes()
+    dataset.file_meta.TransferSyntaxUID = ExplicitVRBigEndian
+    pydicom.dcmwrite(path, dataset, implicit_vr=False, little_endian=False, force_encoding=True)
+    np.testing.assert_array_equal(values(path), PIXELS)
+
+
+def test_pictures_of_a_screen_in_dicom(tmp_path: Path) -> None:
+    grey = (PIXELS >> 4).astype(np.uint8)
+    eight = {"BitsAllocated": 8, "BitsStored": 8, "HighBit": 7}
+    for planar in (0, 1):
+        rgb = np.stack([grey] * 3, 0 if planar else -1)
+        colours = {"SamplesPerPixel": 3, "PlanarConfiguration": planar, "PhotometricInterpretation": "RGB"}
+        found = read_stored(write(tmp_path, grey, PixelData=rgb.tobytes() + b"\0", **colours, **eight))
+        np.testing.assert_array_equal(found.values.numpy(), grey)
+        assert "is a picture of a screen" in found.remarks[0]
+    capture = read_stored(write(tmp_path, grey, SOPClassUID=SecondaryCaptureImageStorage))
+    assert "is a picture of a screen" in capture.remarks[0]
+    assert read_stored(write(tmp_path, grey)).remarks == ()  # a C-arm's own 8 bits
+    with pytest.raises(InputError, match="a colour image"):
+        read_stored(write(tmp_path, grey, PhotometricInterpretation="PALETTE COLOR"))
 
 
 def test_what_the_values_are_is_settled_between_file_and_case(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pydicom
 import pytest
 import SimpleITK as sitk
 import torch
+from fuzz_faults import full_after
 from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
 
@@ -51,6 +52,12 @@ def test_pictures_as_stored(tmp_path: Path, suffix: str, dtype: type) -> None:
     image = read_image(tmp_path / f"view{suffix}")
     assert image.dtype == torch.float32
     np.testing.assert_array_equal(image.numpy(), pixels)
+
+
+def test_a_file_of_several_pages_is_not_read_by_its_first(tmp_path: Path) -> None:
+    cv2.imwritemulti(str(tmp_path / "run.tif"), [PIXELS, PIXELS + 1])
+    with pytest.raises(InputError, match=r"run\.tif: holds 2 pictures, one was expected"):
+        read_image(tmp_path / "run.tif")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
@@ -158,6 +165,18 @@ def test_an_image_of_another_shape_than_the_detector() -> None:
     assert str(raised.value).startswith(
         "case.yaml, views[1].anatomy: view2.tif is 1024 × 1536 pixels, but the C-arm has 1536 × 1536."
     )
+
+
+def test_a_picture_on_a_full_disk_is_told_with_its_name_and_nothing_beside(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Libpng would print a line of its own."""
+    noise = torch.randint(0, 60_000, (64, 64), generator=torch.Generator().manual_seed(0)).to(torch.uint16)
+    with full_after(1000), pytest.raises(OSError, match="File too large") as raised:
+        write_image(tmp_path / "a.png", noise)
+    assert raised.value.filename == str(tmp_path / "a.png")
+    assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

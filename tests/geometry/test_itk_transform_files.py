@@ -1,5 +1,6 @@
 """Transforms of ITK and 3D Slicer: every linear kind in every format, and numbers that do not fit their kind."""
 
+import warnings
 from pathlib import Path
 
 import h5py
@@ -57,11 +58,11 @@ def test_numbers_that_do_not_fit_never_reach_itk(tmp_path: Path, text: str, says
     ("name", "value", "says"),
     [
         ("TransformParameters", np.zeros(5), "5 parameters"),
-        ("TransformParameters", (2**40,), "not the numbers"),
+        ("TransformParameters", (2**40,), "at most 64 numbers"),
         ("TransformFixedParameters", np.zeros(2), "2 fixed"),
         ("TransformParameters", np.full(6, np.nan), "not all finite"),
-        ("TransformParameters", h5py.Empty("f"), "not the numbers"),
-        ("TransformType", h5py.Empty("f"), "cannot be read"),
+        ("TransformParameters", h5py.Empty("f"), "is empty"),
+        ("TransformType", h5py.Empty("f"), "is empty"),
     ],
 )
 def test_hdf5_files_of_other_numbers(tmp_path: Path, name: str, value: object, says: str) -> None:
@@ -79,7 +80,28 @@ def test_hdf5_files_of_other_numbers(tmp_path: Path, name: str, value: object, s
         read_itk_transform(path)
 
 
+@pytest.mark.parametrize("suffix", ["mat", "h5", "tfm"])
+def test_a_file_that_is_cut_off(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"pose.{suffix}"
+    sitk.WriteTransform(KINDS["euler"], str(path))
+    content = path.read_bytes()
+    for size in (0, 1, len(content) // 2, len(content) - 12):
+        path.write_bytes(content[:size])
+        with pytest.raises(InputError, match=rf"pose\.{suffix}"):
+            read_itk_transform(path)
+
+
 def test_a_file_of_another_name_is_no_transform(tmp_path: Path) -> None:
     (tmp_path / "pose.nii").write_bytes(bytes(400))
     with pytest.raises(InputError, match=r"a name that ends in \.tfm"):
         read_itk_transform(tmp_path / "pose.nii")
+
+
+def test_a_number_format_that_is_not_known_is_refused_without_a_warning(tmp_path: Path) -> None:
+    """A MATLAB file of version 4 from a VAX."""
+    header = np.array([2000, 1, 1, 0, 2], "<i4").tobytes()
+    (tmp_path / "a.mat").write_bytes(header + b"x\0" + bytes(8))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError, match=r"a\.mat"):
+            read_itk_transform(tmp_path / "a.mat")

@@ -290,6 +290,46 @@ def test_inspect_says_what_is_there(files: Path, name: str, kind: str, fact: str
     assert (found.picture is not None) == (kind in ("DICOM folder", "CT", "label map", "image", "DICOM image"))
 
 
+def test_inspect_lists_what_stands_together(files: Path, tmp_path: Path) -> None:
+    (files / "torn.stl").write_text("solid of nothing")
+    found = inspect_path(files)
+    (files / "torn.stl").unlink()
+    assert found.kind == "folder of several things"
+    for told in (
+        "ct.nii.gz: CT, 80 × 52 × 60 voxels",
+        "bones.seg.nrrd: label map, 80 × 52 × 60 voxels",
+        "segmentations: folder of masks of bones",
+        "landmarks.mrk.json: landmarks of the hip, FH-l: (110.00,",
+        "plan.mrk.json: points, L-1: (148.00,",
+        "device.stl: mesh, ",
+        "view1.png: image, 40 × 48 pixels",
+    ):
+        assert any(fact.startswith(told) for fact in found.facts), told
+    assert any(fact.startswith("dicom: ") and "CT" in fact for fact in found.facts)
+    assert any(fact.startswith("torn.stl: ") and "mesh" not in fact[:15] for fact in found.facts)
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "view1.png").write_bytes((files / "view1.png").read_bytes())
+    assert inspect_path(tmp_path / "pictures").kind == "folder of images"
+
+
+def test_inspect_tells_other_points_and_boxes_of_segments_without_alarm(files: Path, tmp_path: Path) -> None:
+    points = inspect_path(files / "plan.mrk.json")
+    assert "none of these names is one of the landmarks FH-l" in points.facts[-1]
+    assert not points.warnings
+    image = sitk.ReadImage(str(files / "bones.seg.nrrd"))
+    inside = sitk.LabelShapeStatisticsImageFilter()
+    inside.Execute(sitk.Cast(image > 0, sitk.sitkUInt8))
+    x, y, z, *size = inside.GetBoundingBox(1)
+    box = image[x : x + size[0], y : y + size[1], z : z + size[2]]
+    for key in image.GetMetaDataKeys():
+        if key.startswith("Segment"):
+            box.SetMetaData(key, image.GetMetaData(key))
+    sitk.WriteImage(box, str(tmp_path / "box.seg.nrrd"))
+    found = inspect_path(tmp_path / "box.seg.nrrd")
+    assert not found.warnings  # though every bone touches a face of this file
+    assert "the box of the segments alone" in found.facts[-1]
+
+
 def test_inspect_warns_of_swapped_landmarks_and_unclear_headers(files: Path, tmp_path: Path) -> None:
     other = {"l": "r", "r": "l"}
     swapped = {name[:-1] + other[name[-1]]: point for name, point in landmarks().items()}

@@ -121,32 +121,62 @@ def test_landmarks_in_the_stored_picture_start_from_every_side(tmp_path: Path, d
         start_by_landmarks(wrong, "pelvis", dict(zip(HIP.landmark_names, stored, strict=True)))
 
 
+def pelvis_under(folder: Path, display: Display, turn: torch.Tensor) -> tuple[Case, torch.Tensor, torch.Tensor]:
+    """A case, its true pose, and where its landmarks are seen, 1.5 mm beside, by a camera that is turned (4, 4)."""
+    camera = replace(CAMERA, pixel_mm=(0.5, 0.5), shape=(700, 600), principal_point_px=(300.0, 350.0))
+    half = torch.tensor(LEFT_HALF, dtype=float64)
+    points = torch.stack([half, half * torch.tensor([-1.0, 1, 1], dtype=float64)], 1).flatten(0, 1)
+    forward, down = torch.tensor(display.beam, dtype=float64), torch.tensor([0.0, 0, -1], dtype=float64)
+    truth = torch.eye(4, dtype=float64)
+    truth[:3, :3] = turn[:3, :3] @ torch.stack([torch.linalg.cross(down, forward), down, forward])
+    truth[:3, 3] = torch.tensor([5.0, -8, 700], dtype=float64) - truth[:3, :3] @ points.mean(0)
+    noise = 3 * torch.randn(14, 2, generator=torch.Generator().manual_seed(2), dtype=float64)
+    seen = display.pixels_to_stored(project_points(camera, transform_points(truth, points)) + noise, camera)
+    carm = CArm(camera, (0.0, 0.0, 620.0), (0.0, 1.0, 0.0))
+    landmarks = dict(zip(HIP.landmark_names, points, strict=True))
+    return Case(folder, carm, {}, (View({}),), HIP, landmarks=landmarks, display=display), truth, seen
+
+
 @pytest.mark.parametrize("source", ["left", "right"])
 @pytest.mark.parametrize("tilt_deg", [0, 40])
 def test_from_a_side_landmarks_with_left_and_right_exchanged_are_told(
     tmp_path: Path, source: str, tilt_deg: float
 ) -> None:
     """A pelvis is its own mirror image, and 40° of tilt are those of a cross-table view."""
-    camera = replace(CAMERA, pixel_mm=(0.5, 0.5), shape=(700, 600), principal_point_px=(300.0, 350.0))
-    half = torch.tensor(LEFT_HALF, dtype=float64)
-    points = torch.stack([half, half * torch.tensor([-1.0, 1, 1], dtype=float64)], 1).flatten(0, 1)
-    display = Display(source)  # type: ignore[arg-type]
-    forward, down = torch.tensor(display.beam, dtype=float64), torch.tensor([0.0, 0, -1], dtype=float64)
-    truth = torch.eye(4, dtype=float64)
     tilt = exp_se3(torch.tensor([math.radians(tilt_deg), 0.05, 0, 0, 0, 0], dtype=float64))
-    truth[:3, :3] = tilt[:3, :3] @ torch.stack([torch.linalg.cross(down, forward), down, forward])
-    truth[:3, 3] = torch.tensor([5.0, -8, 700], dtype=float64) - truth[:3, :3] @ points.mean(0)
-    noise = 3 * torch.randn(14, 2, generator=torch.Generator().manual_seed(2), dtype=float64)  # 1.5 mm
-    seen = display.pixels_to_stored(project_points(camera, transform_points(truth, points)) + noise, camera)
-    carm = CArm(camera, (0.0, 0.0, 620.0), (0.0, 1.0, 0.0))
-    landmarks = dict(zip(HIP.landmark_names, points, strict=True))
-    case = Case(tmp_path, carm, {}, (View({}),), HIP, landmarks=landmarks, display=display)
+    case, truth, seen = pelvis_under(tmp_path, Display(source), tilt)  # type: ignore[arg-type]
     found = start_by_landmarks(case, "pelvis", dict(zip(HIP.landmark_names, seen, strict=True)))
     turned = found.camera1_from_object[:3, :3] @ truth[:3, :3].mT
     assert torch.rad2deg(rotation_angle(turned)) < 4
     exchanged = dict(zip(HIP.landmark_names, seen.view(7, 2, 2).flip(1).flatten(0, 1), strict=True))
     with pytest.raises(InputError, match="with left and right exchanged they fit better"):
         start_by_landmarks(case, "pelvis", exchanged)
+
+
+@pytest.mark.parametrize("said", ["anterior", "posterior"])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_view_from_a_side_that_the_case_takes_for_another_one_is_told(
+    tmp_path: Path, said: str, mirrored: bool
+) -> None:
+    case, _, seen = pelvis_under(tmp_path, Display("left"), exp_se3(torch.zeros(6, dtype=float64)))
+    wrong = replace(case, display=Display(said, mirrored))  # type: ignore[arg-type]
+    exchanged = seen.view(7, 2, 2).flip(1).flatten(0, 1)
+    for pixels in (seen, exchanged):
+        with pytest.raises(InputError, match=r"Write `display: {source: (left|right)}`|too few usable landmarks"):
+            start_by_landmarks(wrong, "pelvis", dict(zip(HIP.landmark_names, pixels, strict=True)))
+
+
+@pytest.mark.parametrize(("yaw_deg", "tilt_deg"), [(-50, 0), (50, -20), (0, 65)])
+def test_oblique_and_steep_views_of_the_side_that_the_case_says(
+    tmp_path: Path, yaw_deg: float, tilt_deg: float
+) -> None:
+    """Nothing is said against a source that stands askew, as in inlet, outlet and oblique views."""
+    tilt = exp_se3(torch.tensor([math.radians(tilt_deg), 0, 0, 0, 0, 0], dtype=float64))
+    yaw = exp_se3(torch.tensor([0, math.radians(yaw_deg), 0, 0, 0, 0], dtype=float64))
+    case, truth, seen = pelvis_under(tmp_path, Display("anterior"), tilt @ yaw)
+    found = start_by_landmarks(case, "pelvis", dict(zip(HIP.landmark_names, seen, strict=True)))
+    turned = found.camera1_from_object[:3, :3] @ truth[:3, :3].mT
+    assert torch.rad2deg(rotation_angle(turned)) < 4
 
 
 def test_a_header_against_the_case(tmp_path: Path) -> None:

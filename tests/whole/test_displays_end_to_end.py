@@ -1,4 +1,4 @@
-"""A procedure from behind the patient, stored in several ways, from its images to femur and device."""
+"""Procedures from behind the patient, stored in several ways, and from a side: from images to femur and device."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +12,10 @@ from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
 from torch import Tensor
 
 from femoreg_torch.case import Case, Result, read_case, write_case
-from femoreg_torch.case.femoroplasty import DEVICE, FEMUR
+from femoreg_torch.case.femoroplasty import DEVICE, FEMUR, PELVIS
 from femoreg_torch.evaluation import evaluate
 from femoreg_torch.fluoro import Display, read_image
-from femoreg_torch.geometry import transform_points
+from femoreg_torch.geometry import project_points, transform_points
 from femoreg_torch.registration.run import register_scene
 from sim.theatre.case_folders import write_phantom, write_simulation
 
@@ -71,7 +71,7 @@ def stored(case: Case, folder: Path, display: Display, photometric: str, binning
     tags = {
         "DistanceSourceToDetector": camera.sdd_mm,
         "ImagerPixelSpacing": list(turned.pixel_mm),
-        "PositionerPrimaryAngle": 0,  # the detector in front of the patient
+        "PositionerPrimaryAngle": {"posterior": 0, "right": 90}[display.source],  # of the detector, from the front
     }
     views = []
     for number, view in enumerate(case.views):
@@ -116,3 +116,27 @@ def test_a_procedure_from_behind_is_found_however_it_is_stored(simulated: Case, 
         found[name] = result
     apart = {name: moved_mm(simulated, found["usual"], found[name]) for name in ("turned", "binned")}
     assert max(apart.values()) < _SAME_MM
+
+
+@pytest.mark.long
+def test_a_first_view_from_a_side_starts_from_landmarks_picked_by_hand(tmp_path: Path) -> None:
+    write_phantom(tmp_path / "patient", 31, "left", 1.0)
+    carm = _CARM | {"isocentre_mm": [0, 0, 640], "orbit_axis": [0, 1, 0]}
+    (tmp_path / "carm.yaml").write_text(yaml.safe_dump(carm))
+    orbit = {"orbit_deg": [[95, 3], [122, 2], [68, 2]], "head_depth_mm": 660, "device_depth_mm": 600}
+    settings = {"extends": "paper", "carm": str(tmp_path / "carm.yaml"), "acquisition": orbit}
+    (tmp_path / "sim.yaml").write_text(yaml.safe_dump(settings))
+    write_simulation(tmp_path / "patient", tmp_path / "case", 5, "left", str(tmp_path / "sim.yaml"), lambda _: None)
+    case = stored(read_case(tmp_path / "case"), tmp_path / "stored", Display("right"), "MONOCHROME2", 1)
+    assert case.truth is not None
+    camera, points = case.carm.camera, torch.stack(list(case.landmarks.values()))
+    seen = project_points(camera, transform_points(case.truth.camera1_from[PELVIS], points))
+    seen = seen + 3 * torch.randn(seen.shape, generator=torch.Generator().manual_seed(0), dtype=seen.dtype)
+    inside = ((seen > 0) & (seen < camera.shape[0])).all(1)
+    pixels = case.display.pixels_to_stored(seen, camera)
+    picked = {name: pixel for name, pixel, there in zip(case.landmarks, pixels, inside, strict=True) if there}
+    result, scene = register_scene(case, None, "fast", seed=0, landmarks=picked)
+    errors = evaluate(case, result, scene)
+    assert result.verdict.trusted, result.verdict.sentence
+    assert errors["entry_point_mm"] < 1
+    assert errors["tip_mm"] < 1

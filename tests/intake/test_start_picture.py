@@ -1,0 +1,25 @@
+"""What `femoreg check` says of a device that the images hardly show."""
+
+import pytest
+import torch
+
+from femoreg_torch.geometry import CArm, centred_camera, first_view_only, rigid
+from femoreg_torch.intake.start_picture import hardly_shown
+from femoreg_torch.registration.scene import RigidObject, Scene
+from femoreg_torch.volume import Volume
+
+
+@pytest.mark.parametrize(("aside_mm", "shown"), [(0.0, None), (40.0, None), (61.8, "20% of it"), (400.0, "0% of it")])
+def test_a_device_beside_the_picture_is_told(aside_mm: float, shown: str | None) -> None:
+    """A bar of 40 mm at half the source distance, where the picture is 99 mm wide: 8 of its 40 columns."""
+    bar = torch.zeros(8, 8, 44)
+    bar[2:6, 2:6, 2:42] = 0.3
+    away = torch.eye(4, dtype=torch.float64)
+    away[:3, 3] = torch.tensor([-21.5, -3.5, -3.5])
+    carm = CArm(centred_camera(1000.0, (2.0, 2.0), (100, 100)), (0.0, 0.0, 500.0), (0.0, 1.0, 0.0))
+    thing = RigidObject(Volume(bar, away), torch.zeros(3).double(), ("device",))
+    scene = Scene(carm, {"device": thing}, {"device": (torch.zeros(100, 100),)})
+    place = rigid(translation=torch.tensor([aside_mm, 0, 500], dtype=torch.float64))
+    told = hardly_shown(scene, first_view_only({"device": place}, 1), ["device", "bone"])
+    assert len(told) == (0 if shown is None else 1)
+    assert shown is None or f"device: where it is meant to stand, {shown}" in told[0]
