@@ -62,6 +62,7 @@ html_static_path = ["site/static"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
+html_show_search_summary = False  # read by `fetch`, which browsers refuse to pages that were opened from disk
 pygments_style = "friendly"
 # Nothing comes from outside: no widgets of notebooks, no fonts, no formulas by script.
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}

@@ -61,7 +61,14 @@ def read_kind(group: Group, builtin: Mapping[str, Any], content: Any, where: str
     Raises `InputError` that starts with `where`, see `find` and `read_record`.
     """
     kind, rest = pop_kind(content, where)
-    return read_record(record_of(find(group, kind, builtin, where), where), rest, f"{where}, {kind}")
+    record, where = record_of(find(group, kind, builtin, where), where), f"{where}, {kind}"
+    fields = [field.name for field in dataclasses.fields(record)]
+    if unknown := [key for key in rest if key not in fields]:
+        raise InputError(
+            f"{where}: unknown key {shortened(unknown[0])}. Known keys: {', '.join(fields)}. If it stands in a preset "
+            "that this one extends, null in place of its value takes it away."
+        )
+    return read_record(record, rest, where)
 
 
 def record_of(found: Any, where: str) -> Any:

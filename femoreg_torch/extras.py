@@ -16,8 +16,8 @@ _EXTRA_OF = {  # by import name; the extras themselves stand in pyproject.toml
     "imageio_ffmpeg": "video",
     "starlette": "review",
     "uvicorn": "review",
-    "pyarrow": "all",  # in both `study` and `plan`
-    "matplotlib": "all",  # in `train`, `study` and `plan`
+    "pyarrow": "plan",  # in `study` too, and in `train` matplotlib; their commands miss others of their extras first
+    "matplotlib": "plan",
 }
 
 

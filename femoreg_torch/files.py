@@ -23,6 +23,8 @@ from femoreg_torch.text import MOST_JSON_BYTES, json_content, read_bytes
 _RANDOM_PART = "????????"  # of a name by tempfile.mkdtemp
 _SUFFIX = ".part"
 _LONGEST_NAME = 240  # bytes; Linux allows 255, and the hidden folder beside has a name that is longer by 15
+_NO_ROOM = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT}
+_MOST_NEW = 50  # folders that are made for one that is asked for; Python makes them by recursion
 _LOCK, _NEW, _OLD = "lock", "new", "old"  # what a workshop holds: a lock, what is being written, what it replaces
 
 
@@ -123,7 +125,10 @@ def check_new_folder(path: Path, source: Path | None = None) -> Path:
         raise InputError(f"{real}: is the folder that is read. Choose another one for the output.")
     if there and real.is_mount():
         raise InputError(f"{real}: is a mount point, which cannot be replaced as a whole. Choose a folder inside it.")
-    above = next(parent for parent in real.parents if parent.exists())
+    missing, above = next((n, parent) for n, parent in enumerate(real.parents) if parent.exists())
+    names = [real.name, *(parent.name for parent in real.parents[:missing])]
+    if missing > _MOST_NEW or any(len(os.fsencode(name)) > _LONGEST_NAME for name in names):
+        raise InputError(f"{shortened(real, 200)}: its name, or the path to it, is too long. Choose another one.")
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         raise InputError(f"{real}: cannot be written, {above} is no folder or not yours. Choose another place.")
     return real
@@ -208,6 +213,10 @@ def _workshop(path: Path) -> Iterator[Path]:
     try:
         (workshop / _NEW).mkdir()
         yield workshop
+    except OSError as error:
+        if error.filename is None and error.errno in _NO_ROOM:  # the system does not say for which file
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
     finally:
         shutil.rmtree(workshop, ignore_errors=True)  # what cannot be removed now is a leftover
         os.close(lock)

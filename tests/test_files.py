@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fuzz_faults import FAULT, fault
+from fuzz_faults import FAULT, fault, full_after
 
 from femoreg_torch import files
 from femoreg_torch.errors import InputError
@@ -54,6 +54,13 @@ def test_a_failed_build_leaves_nothing(tmp_path: Path) -> None:
         fail_while_building(tmp_path / "run")
     assert names(tmp_path) == ["run"]
     assert (tmp_path / "run" / "result.json").read_text() == "old"
+
+
+def test_a_full_disk_is_told_with_the_name(tmp_path: Path) -> None:
+    with full_after(100), pytest.raises(OSError, match="File too large") as raised:
+        write_text(tmp_path / "a.txt", "a" * 1000)
+    assert raised.value.filename == str(tmp_path / "a.txt")
+    assert names(tmp_path) == []
 
 
 def test_only_what_was_built_is_replaced(tmp_path: Path) -> None:
@@ -334,13 +341,17 @@ def test_json_is_readable_and_exact_to_nine_decimals(tmp_path: Path) -> None:
     assert names(tmp_path) == ["a.json"]
 
 
-@pytest.mark.parametrize("kind", ["loop", "file", "below a file", "long", "null"])
+@pytest.mark.parametrize("kind", ["loop", "file", "below a file", "long", "null", "a long name", "deep"])
 def test_where_no_folder_can_be_is_told_before_anything_is_computed(tmp_path: Path, kind: str) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     (tmp_path / "file").write_text("mine")
-    path = {"below a file": tmp_path / "file" / "run", "long": tmp_path / ("x" * 5000), "null": tmp_path / "a\0b"}.get(
-        kind, tmp_path / kind
-    )
+    path = {
+        "below a file": tmp_path / "file" / "run",
+        "long": tmp_path / ("x" * 5000),
+        "null": tmp_path / "a\0b",
+        "a long name": tmp_path / ("x" * 250),  # that of the hidden folder beside it would be too long
+        "deep": tmp_path / ("x/" * 1900),
+    }.get(kind, tmp_path / kind)
     with pytest.raises(InputError) as raised:
         check_new_folder(path)
     assert len(str(raised.value)) < 500

@@ -52,22 +52,23 @@ def write_accuracy(out: Path, readings: Sequence[Reading], altered: Mapping[str,
 
 
 def _figures(accuracy: Accuracy) -> list[str]:
-    """All figures with 95 % intervals, then the landmarks one by one."""
+    """All figures, with 95 % intervals where there are several patients, then the landmarks one by one."""
+    several = accuracy.patients > 1
+    of = f"{accuracy.patients} patients" if several else "one patient, which tells no intervals"
+    told = "; brackets hold the 95 % interval by bootstrap over patients" if several else ""
     lines = [
-        f"{accuracy.images} images of {accuracy.patients} patients. Errors are on the detector; brackets hold the 95 % "
-        "interval by bootstrap over patients.",
+        f"{accuracy.images} images of {of}. Errors are on the detector{told}.",
         "",
         "| | |",
         "| --- | --- |",
-        *(f"| {name} | {_value(accuracy.measures[key], unit)} |" for key, (name, unit) in _ROWS.items()),
+        *(f"| {name} | {_value(accuracy.measures[key], unit, several)} |" for key, (name, unit) in _ROWS.items()),
         "",
         "| landmark | mean, mm | median, mm | recall | in the image |",
         "| --- | --- | --- | --- | --- |",
     ]
     for name, one in accuracy.landmarks.items():
-        lines.append(
-            f"| {name} | {one.mean_mm:.1f} | {one.median_mm:.1f} | {100 * one.recall:.0f} % | {one.in_image} |"
-        )
+        found = [_number(one.mean_mm, 1), _number(one.median_mm, 1), _number(100 * one.recall, 0, " %")]
+        lines.append(f"| {name} | {' | '.join(found)} | {one.in_image} |")
     return lines
 
 
@@ -93,10 +94,17 @@ def _altered(altered: Mapping[str, Outcomes]) -> list[str]:
     ]
 
 
-def _value(measure: Measure, unit: str) -> str:
-    if math.isnan(measure.value):
-        return "–"
+def _value(measure: Measure, unit: str, several: bool) -> str:
     if unit == _SHARE:
-        return f"{100 * measure.value:.1f} % ({100 * measure.low:.1f} to {100 * measure.high:.1f})"
-    digits = 1 if unit else 2
-    return f"{measure.value:.{digits}f} {unit}".rstrip() + f" ({measure.low:.{digits}f} to {measure.high:.{digits}f})"
+        scale, digits, written = 100, 1, " %"
+    else:
+        scale, digits, written = 1, 1 if unit else 2, f" {unit}" if unit else ""
+    value = _number(scale * measure.value, digits, written)
+    if not several or math.isnan(measure.value):
+        return value
+    return f"{value} ({scale * measure.low:.{digits}f} to {scale * measure.high:.{digits}f})"
+
+
+def _number(value: float, digits: int, unit: str = "") -> str:
+    """A dash where nothing was measured."""
+    return "–" if math.isnan(value) else f"{value:.{digits}f}{unit}"

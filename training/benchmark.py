@@ -44,13 +44,14 @@ def benchmark(
     from torch import Tensor
 
     from femoreg_torch.detect import load_network
-    from femoreg_torch.files import write_text
+    from femoreg_torch.files import check_new_folder, new_folder, write_text
     from femoreg_torch.neighbours.deepfluoro import is_full_resolution
     from training.accuracy_page import write_accuracy
     from training.labelled import LabelledImage, cadavers, deepfluoro_images
     from training.measure import Reading, Registration, read_images
     from training.single_view import registration_of
 
+    check_new_folder(out)
     network, console = load_network(weights), Console()
     readings: list[Reading] = []
     seconds: list[float] = []
@@ -71,9 +72,10 @@ def benchmark(
             console.print(f"{cadaver.name}: {len(readings)} images so far", highlight=False)
     else:
         readings = read_images(network, deepfluoro_images(file))
-    write_accuracy(out, readings, {})
-    page = beside(readings, seconds)
-    write_text(out / "beside.md", page)
+    with new_folder(out) as built:
+        write_accuracy(built, readings, {})
+        page = beside(readings, seconds)
+        write_text(built / "beside.md", page)
     console.print(page, highlight=False)
 
 

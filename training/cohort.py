@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import network_camera
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import load_carm
@@ -97,7 +98,13 @@ def render_cohort(
 def _read_case(folder: Path) -> Layers:
     ct = read_ct(folder / "ct.nii.gz")
     labels = read_labels(folder / "labels.nii.gz", ct)
-    return split_layers(ct, labels, read_landmarks(folder / "landmarks.json"))
+    landmarks = read_landmarks(folder / "landmarks.json")
+    if missing := [name for name in HIP.landmark_names if name not in landmarks]:
+        raise InputError(
+            f"{folder / 'landmarks.json'}: to train, all {len(HIP.landmarks)} landmarks are needed, {len(missing)} are "
+            f"missing: {', '.join(missing)}."
+        )
+    return split_layers(ct, labels, landmarks)
 
 
 def _make_patient(seed: int, spacing_mm: float) -> Layers:

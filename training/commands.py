@@ -77,7 +77,7 @@ def measure(
 
     from femoreg_torch.detect import load_network
     from femoreg_torch.errors import InputError
-    from femoreg_torch.files import check_new_folder
+    from femoreg_torch.files import check_new_folder, new_folder
     from training.accuracy_page import write_accuracy
     from training.labelled import images_of_file
     from training.measure import Reading, read_images
@@ -96,7 +96,9 @@ def measure(
     for name, alter in (ALTERATIONS if altered else {}).items():
         changed = (alter(image) for path in images for image in images_of_file(path))
         counted[name] = outcomes(read_images(network, changed))
-    Console().print(write_accuracy(out, readings, counted), highlight=False)
+    with new_folder(out) as built:
+        page = write_accuracy(built, readings, counted)
+    Console().print(page, highlight=False)
 
 
 def train_segmentation(

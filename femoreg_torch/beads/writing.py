@@ -20,6 +20,7 @@ from femoreg_torch.evaluation.overlay import monitor_picture
 from femoreg_torch.files import new_folder, temporary_file, write_json
 from femoreg_torch.fluoro import read_image, write_image
 from femoreg_torch.geometry import Camera
+from femoreg_torch.pictures import write_picture
 from femoreg_torch.volume import read_ct, write_volume
 
 UNCERTAINTY_NAME, BEADS_NAME, PICTURE_NAME = "truth_uncertainty.json", "beads.csv", "beads.png"
@@ -52,8 +53,7 @@ def write_measured(out: Path, case: Case, found: Measured) -> None:
         _write_table(folder / BEADS_NAME, found)
         picture = beads_picture(case, found)
         with temporary_file(folder / PICTURE_NAME) as part:
-            if not cv2.imwrite(str(part), picture):
-                raise OSError(f"{out / PICTURE_NAME}: the picture could not be written.")
+            write_picture(part, picture)
 
 
 def uncertainty_content(case: Case, found: Measured) -> dict[str, object]:

@@ -11,9 +11,11 @@ import ast
 import atexit
 import gc
 import inspect
+import io
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.machinery import PathFinder
@@ -71,6 +73,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read the output has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it ends
         return BAD_INPUT
+    except SystemExit as error:  # rich's end where the reader has gone is 1, that of `--help` is 0
+        if error.code != 1:
+            raise
+        return BAD_INPUT
     except OSError as error:
         place = "a file could not be read or written" if error.filename is None else error.filename
         return _complain(f"{place}: {error.strerror or error}.")
@@ -101,14 +107,26 @@ def console_script() -> NoReturn:
     Taking modules and memory apart one by one takes more than a second after a registration, and the system does it at
     once. Before that, threads have ended, and all that was registered for the end has run.
     """
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:  # closed by whoever started this; its number must not become that of a file
-            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115
+    prepare_process()
     gc.set_threshold(*_COLLECTED_AFTER)
     ended: list[int] = []
     atexit.register(_end, ended)  # what is registered first runs last
     ended.append(main())
     sys.exit(ended[0])
+
+
+def prepare_process() -> None:
+    """Streams that take all that is printed, and no warnings of libraries, unless Python was asked for them."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed by whoever started this; its number must not become that of a file
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            with suppress(OSError):  # a stream that has become another one
+                stream.reconfigure(errors="backslashreplace")  # few letters, in an old locale: no × and ü
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+        os.environ["PYTHONWARNINGS"] = "ignore"  # for processes that this one starts
 
 
 def _end(ended: Sequence[int]) -> None:
@@ -207,6 +225,9 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
 
     if any(word == "" or re.fullmatch(r"--[\w-]+=", word) for word in arguments):
         raise InputError(f"{name}: an argument is empty. Is a variable of the shell not set?")
+    options = [word.partition("=")[0] for word in arguments if word.startswith("--") and word != "--"]
+    if twice := next((word for word in options if options.count(word) > 1), None):
+        raise InputError(f"{name}: {shortened(twice)} stands there twice. Keep one.")
     parser = parser_of(function, name)
     try:
         values = parser.instantiate(parser.parse_args(arguments))

@@ -57,6 +57,7 @@ def review(
     with only_review(run), socket.socket() as listening:
         try:
             listening.bind((LOOPBACK, port))
+            listening.listen()  # or who opens the address at once is refused
         except (OSError, OverflowError) as error:
             raise InputError(
                 f"--port {port}: cannot listen there ({error}). Leave it out to take a free one."

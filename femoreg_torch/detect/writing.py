@@ -12,6 +12,7 @@ from femoreg_torch.detect.network import Detection
 from femoreg_torch.detect.overlay import draw_overlay
 from femoreg_torch.files import new_folder
 from femoreg_torch.geometry import Camera
+from femoreg_torch.pictures import write_picture
 from femoreg_torch.volume import write_landmarks
 
 COLUMNS = ("image", "landmark", "column_px", "row_px", "confidence", "visible")
@@ -30,7 +31,7 @@ def write_detections(
         for path, image, detection in zip(paths, attenuation, detections, strict=True):
             write_landmarks(folder / f"{path.stem}.mrk.json", _in_image_plane(detection))
             picture = draw_overlay(image, detection, camera)
-            cv2.imwrite(str(folder / f"{path.stem}.png"), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+            write_picture(folder / f"{path.stem}.png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
 
 
 def _rows(path: Path, detection: Detection) -> list[list[object]]:

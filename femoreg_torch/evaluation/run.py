@@ -3,13 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from femoreg_torch.case import Case, Result, new_folder
 from femoreg_torch.evaluation.errors import errors, reference_points
 from femoreg_torch.evaluation.fit import check_fits
 from femoreg_torch.evaluation.overlay import draw, overlay_figure
 from femoreg_torch.files import write_json, write_text
+from femoreg_torch.pictures import write_picture
 from femoreg_torch.registration import Scene, prepare_scene
 
 ERRORS_NAME, OVERLAY_NAME, REPORT_NAME = "errors.json", "overlay.png", "report.html"
@@ -43,8 +42,7 @@ def write_report(case: Case, result: Result, run: Path) -> dict[str, Any] | None
     with new_folder(run, without=EVALUATION_NAMES) as folder:
         if found is not None:
             write_json(folder / ERRORS_NAME, found)
-        if not cv2.imwrite(str(folder / OVERLAY_NAME), overlay):
-            raise OSError(f"{run / OVERLAY_NAME}: the picture could not be written.")
+        write_picture(folder / OVERLAY_NAME, overlay)
         write_text(folder / REPORT_NAME, page)
     return found
 

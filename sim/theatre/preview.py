@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
 from femoreg_torch.evaluation.overlay import Picture, monitor_picture
 from femoreg_torch.fluoro import attenuation_image, downsample, find_shutter
 from femoreg_torch.geometry import Camera
+from femoreg_torch.pictures import write_picture
 from sim.theatre.images import ViewImages
 
 _PREVIEW_PX = 512  # width of one image, or a little more: the detector is averaged over whole blocks
@@ -21,8 +21,7 @@ def write_preview(path: Path, images: list[ViewImages], camera: Camera) -> None:
     beside its shade.
     """
     rows = [np.hstack([_shown(getattr(view, name), camera) for view in images]) for name in ("anatomy", "device")]
-    if not cv2.imwrite(str(path), np.vstack(rows)):
-        raise OSError(f"{path}: the preview could not be written.")
+    write_picture(path, np.vstack(rows))
 
 
 def _shown(raw: torch.Tensor, camera: Camera) -> Picture:

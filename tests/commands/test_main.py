@@ -1,5 +1,6 @@
 """The command line: what it finds, how it parses, and that bad input ends in one line and exit status 2."""
 
+import os
 import subprocess
 import sys
 import time
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
+from rich.console import Console
 
 import femoreg_torch
 from femoreg_torch.commands import main as module
@@ -285,6 +287,31 @@ def test_streams_that_are_closed_or_full(redirected: str, status: int, lines: in
     assert b"Traceback" not in done.stderr
 
 
+def test_who_read_the_output_goes_while_a_table_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rich ends the process with 1 then, which is the status of a study whose run failed."""
+    ours, theirs = os.pipe()
+    os.close(ours)
+    with os.fdopen(theirs, "w") as out:
+        monkeypatch.setattr(sys, "stdout", out)
+        monkeypatch.setattr(module, "_carry_out", lambda *_: Console().print("table"))
+        assert main(["tables", "study"]) == 2
+
+
+@pytest.mark.parametrize(("options", "lines"), [("", 0), ("-W default", 1)])
+def test_letters_that_the_terminal_lacks_and_warnings_of_libraries(options: str, lines: int) -> None:
+    code = (
+        "import sys, warnings\n"
+        "from femoreg_torch.commands import main\n"
+        "main._carry_out = lambda *_: (warnings.warn('of a library'), print('64 \u00d7 64'), 0)[2]\n"
+        "main.console_script()"
+    )
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, *options.split(), "-c", code]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "64 \\xd7 64\n")
+    assert done.stderr.count("\n") == lines
+
+
 def test_without_stderr_the_status_tells(tmp_path: Path) -> None:
     for redirected in ("2>&-", "2> /dev/full"):
         command = ["bash", "-c", f"'{FEMOREG}' nosuch {redirected}"]
@@ -295,6 +322,7 @@ def test_without_stderr_the_status_tells(tmp_path: Path) -> None:
     ("arguments", "says"),
     [
         (["--seed", "1e308"], "--seed: a whole number was expected, found '1"),
+        (["--seed", "1", "--seed=2"], "measure: '--seed' stands there twice"),
         (["--preset", "rough"], "--preset: one of 'paper', 'fast' was expected, found 'rough'"),
         (["--spacing-mm", ".."], "--spacing-mm: a number was expected, found '"),
     ],

@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from page_blocks import ROOT, Block, blocks_of, pages
 
 from femoreg_torch.commands.main import GROUP, parser_of
 from femoreg_torch.errors import InputError
+from femoreg_torch.registration import load_plan
 from femoreg_torch.text import yaml_content
 
 SHELL, PYTHON = ("sh", "bash"), "python"
@@ -85,10 +87,34 @@ def test_python_on_a_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.Mo
             run_python(block, names)
 
 
+def test_the_similarity_of_the_tutorial_is_one_of_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page's class, entry point and preset, installed as a reader would install them."""
+    blocks = blocks_of("docs/tutorials/own-similarity.md")
+    (code,) = (block.code for block in blocks if block.code.startswith("@dataclass"))
+    (project,) = (tomllib.loads(block.code) for block in blocks if block.language == "toml")
+    (preset,) = (block.code for block in blocks if block.language == "yaml")
+    group = "femoreg_torch.similarities"
+    lines = [f"[{group}]", *(f"{name} = {place}" for name, place in project["project"]["entry-points"][group].items())]
+    metadata = tmp_path / "my_package-0.1.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 0.1\n")
+    (metadata / "entry_points.txt").write_text("\n".join(lines))
+    (tmp_path / "my_package.py").write_text(f"from dataclasses import dataclass\n\nimport torch\n\n\n{code}")
+    (tmp_path / "my_preset.yaml").write_text(preset)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    similarities = {
+        step.name: getattr(step, "similarity", None) for step in load_plan(tmp_path / "my_preset.yaml").steps
+    }
+    sys.modules.pop("my_package")
+    assert repr(similarities["everything together, fine"]) == "RobustDifferences(scale=0.2)"
+    assert sum(type(one).__name__ == "RobustDifferences" for one in similarities.values()) == 1
+
+
 @pytest.mark.long
 def test_what_is_run_apart_runs_from_the_first_page_to_the_last(tmp_path: Path) -> None:
     """In one folder, each block in a process of its own, as a reader would who takes one page after the other."""
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    without_limits = {key: value for key, value in os.environ.items() if not key.endswith("_NUM_THREADS")}
+    environment = without_limits | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
     apart = [block for page in APART for block in blocks_of(page) if block.mark == "run apart"]
     assert len(apart) > 8
     for block in apart:

@@ -15,7 +15,8 @@ from page_blocks import ROOT
 CHECK = ROOT / "docs" / "site" / "check_site.py"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 PLAIN = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
-VISITED = ("index.html", "docs/concepts/frames-drawn.html", "docs/reference/api.html", "notebooks/own_parts.html")
+
+SLOW_MS = 180_000  # the longest that a page may take on a machine with much else to do
 
 
 def checked(folder: Path) -> subprocess.CompletedProcess[str]:
@@ -67,17 +68,38 @@ def test_no_link_is_broken_and_nothing_comes_from_elsewhere(site: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
-def test_a_browser_asks_nobody_else(site: Path, address: str) -> None:
+@pytest.mark.parametrize("door", ["served", "opened from disk"])
+def test_a_browser_asks_nobody_else(door: str, site: Path, address: str) -> None:
+    """Every page of the site, search and both colour schemes: what is asked for is there, and part of the site."""
     playwright = pytest.importorskip("playwright.sync_api")
-    asked: list[str] = []
+    root = address if door == "served" else site.as_uri()
+    pages = [path.relative_to(site).as_posix() for path in sorted(site.rglob("*.html"))]
+    asked, lost = [], []
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=PLAIN)
-        page = browser.new_page()
-        page.on("request", lambda request: asked.append(request.url))
-        for place in VISITED:
-            page.goto(f"{address}/{place}", wait_until="networkidle")
-        page.goto(f"{address}/search.html?q=pelvis", wait_until="networkidle")
+        context = browser.new_context()  # its requests are those of all pages and workers
+        context.on("request", lambda request: asked.append(request.url))
+        context.on("requestfailed", lambda request: lost.append(request.url))
+        context.on("response", lambda answer: lost.append(answer.url) if answer.status >= 400 else None)
+        page = context.new_page()
+        page.set_default_timeout(SLOW_MS)
+        page.on("pageerror", lambda error: lost.append(f"{page.url}: {error}"))
+        page.on("websocket", lambda socket: asked.append(socket.url))
+        for place in pages:
+            page.goto(f"{root}/{place}", wait_until="load")
+            if place == "index.html":  # leads on, and would interrupt the next
+                page.wait_for_url(f"{root}/docs/index.html")
+            page.mouse.wheel(0, 20_000)  # what is loaded when it comes into view
+        page.goto(f"{root}/docs/index.html", wait_until="networkidle")
+        schemes = set()
+        for _ in range(3):  # as the system has it, light, dark
+            page.locator("button.theme-toggle:visible").first.click()
+            schemes.add(page.evaluate("document.body.dataset.theme"))
+        page.goto(f"{root}/search.html?q=pelvis", wait_until="networkidle")
         page.wait_for_selector("#search-results a")
         browser.close()
-    assert len(asked) > 20
-    assert not [url for url in asked if not url.startswith((address, "data:"))]
+    assert schemes == {"auto", "light", "dark"}
+    assert len(pages) > 40
+    assert len(set(asked)) > len(pages)
+    assert not [url for url in asked if not url.startswith((f"{root}/", "data:"))]
+    assert not lost

@@ -26,7 +26,7 @@ from femoreg_torch.case import read_case, read_result
 from femoreg_torch.case.start_files import read_pixels, read_start_poses
 from femoreg_torch.detect import load_network
 from femoreg_torch.fluoro import read_image
-from femoreg_torch.geometry import centred_camera, load_carm
+from femoreg_torch.geometry import centred_camera, load_carm, read_itk_transform
 from femoreg_torch.navigation import read_robot
 from femoreg_torch.neighbours.deepfluoro import (
     is_full_resolution,
@@ -258,8 +258,11 @@ def _points(folder: Path) -> Iterator[Door]:
     yield _bytes("calibration", folder / "r.txt", robot.encode(), lambda path: read_robot(path, "device"))
     transform = sitk.Euler3DTransform()
     transform.SetTranslation((100.0, 0.0, 900.0))
-    sitk.WriteTransform(transform, str(folder / "base_from_device.tfm"))
+    for suffix in ("tfm", "h5", "mat"):
+        sitk.WriteTransform(transform, str(folder / f"base_from_device.{suffix}"))
     yield _made("calibration, tfm", folder / "base_from_device.tfm", lambda path: read_robot(path, "device"))
+    for suffix in ("h5", "mat"):
+        yield _made(f"transform, {suffix}", folder / f"base_from_device.{suffix}", read_itk_transform)
 
 
 def _volumes(folder: Path) -> Iterator[Door]:

@@ -28,12 +28,9 @@ from femoreg_torch.review.kept import landmarks_path, start_path
 
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright here: it comes with the extra `dev`")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = [
-    pytest.mark.long,  # it starts the command three times, and a registration each time
-    pytest.mark.skipif(
-        CHROMIUM is None, reason="no Chromium here: install your distribution's, such as `apt-get install chromium`"
-    ),
-]
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium here: install your distribution's, such as `apt-get install chromium`"
+)
 SLOW_MS = 180_000  # the longest that anything may take on a machine with much else to do
 
 

@@ -1,12 +1,17 @@
 """The files of a measurement: figures by the names of bones and landmarks, and what was not measured left out."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz_faults import full_after
 
+import femoreg_torch.detect
+import training.measure
 from femoreg_torch.anatomy import HIP
+from femoreg_torch.commands.main import main
 from training.accuracy_page import write_accuracy
 from training.measure import Reading
 from training.robustness import Outcomes
@@ -25,8 +30,8 @@ def test_figures_are_told_by_name(readings: list[Reading], tmp_path: Path) -> No
     page = write_accuracy(tmp_path / "out", readings, {"turned": Outcomes(5, 3, 1)})
     assert page == (tmp_path / "out" / "accuracy.md").read_text(encoding="utf-8")
     lines = page.splitlines()
-    assert "| Dice, femur left | 0.75 (0.75 to 0.75) |" in lines
-    assert "| landmark error, median | 2.0 mm (2.0 to 2.0) |" in lines
+    assert "| Dice, femur left | 0.75 |" in lines
+    assert "| landmark error, median | 2.0 mm |" in lines
     assert "| GSN-r | 2.0 | 2.0 | 100 % | 1 |" in lines
     assert "| turned | 5 | 3 | 1 |" in lines
     content = json.loads((tmp_path / "out" / "accuracy.json").read_text(encoding="utf-8"))
@@ -36,7 +41,34 @@ def test_figures_are_told_by_name(readings: list[Reading], tmp_path: Path) -> No
     assert (tmp_path / "out" / "reliability.png").is_file()
 
 
+def test_several_patients_have_intervals_and_landmarks_that_no_image_shows_a_dash(
+    readings: list[Reading], tmp_path: Path
+) -> None:
+    unseen = np.array([name != "GSN-r" for name in HIP.landmark_names])
+    other = replace(readings[0], patient="two", error_mm=np.full(len(unseen), 4.0))
+    both = [replace(one, visible=unseen, found=unseen) for one in (readings[0], other)]
+    lines = write_accuracy(tmp_path, both, {}).splitlines()
+    assert lines[0].startswith("2 images of 2 patients.")
+    assert "| landmark error, mean | 3.0 mm (2.0 to 4.0) |" in lines
+    assert "| GSN-r | – | – | – | 0 |" in lines
+
+
 def test_what_was_not_measured_is_left_out(readings: list[Reading], tmp_path: Path) -> None:
     page = write_accuracy(tmp_path, readings, {})
     assert "altered" not in page
     assert "| pelvis within 1° after single-view registration | – |" in page.splitlines()
+
+
+@pytest.mark.parametrize("command", ["measure", "benchmark"])
+def test_on_a_full_disk_no_part_of_the_files_is_written(
+    command: str, readings: list[Reading], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(femoreg_torch.detect, "load_network", lambda _: None)
+    monkeypatch.setattr(training.measure, "read_images", lambda *_, **__: readings)
+    (tmp_path / "a.h5").touch()
+    files = ["deepfluoro", str(tmp_path / "a.h5"), "--detection-only"] if command == "benchmark" else [str(tmp_path)]
+    with full_after(12_000):  # the picture is larger
+        assert main([command, *files, "--out", str(tmp_path / "out")]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+    assert main([command, *files, "--out", str(tmp_path / "out")]) == 0
+    assert len(list((tmp_path / "out").iterdir())) == (4 if command == "benchmark" else 3)

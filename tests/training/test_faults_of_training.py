@@ -67,6 +67,20 @@ def test_a_step_that_fails(n: int, prepared: list[str], tmp_path: Path, capsys: 
     assert failing_at(n, prepared, tmp_path / "out", capsys)
 
 
+def test_a_case_that_lacks_a_landmark(case: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(case, tmp_path / "case")
+    path = tmp_path / "case" / "landmarks.json"
+    content = json.loads(path.read_text())
+    del content["landmarks"]["FH-r"]
+    path.write_text(json.dumps(content))
+    (tmp_path / "tiny.yaml").write_text(SETTINGS)
+    arguments = ["train", str(tmp_path / "tiny.yaml"), "--cases", f"[{tmp_path / 'case'}]"]
+    assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr().err
+    assert "1 are missing: FH-r" in told
+    assert told.count("\n") == 1
+
+
 @pytest.mark.long
 def test_every_step_that_fails(prepared: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     steps = next(n for n in range(1, MOST_STEPS) if not failing_at(n, prepared, tmp_path / "out", capsys))
