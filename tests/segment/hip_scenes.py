@@ -13,13 +13,18 @@ from femoreg_torch.volume import Volume, axis_aligned
 
 HIP_LEFT, FEMUR_LEFT = 1 + HIP.bone_names.index("hip_left"), 1 + HIP.bone_names.index("femur_left")
 HEAD, RADIUS_MM, GAP_MM = np.array([60.0, 5.0, 40.0]), 23.0, 3.0
+_PART_MM = 0.75  # about so fine are the solids sampled
 _LOW, _HIGH = np.array([0.0, -50.0, -60.0]), np.array([120.0, 60.0, 110.0])
 
 
 def hip_scene(spacing: tuple[float, float, float], metal: bool = False) -> tuple[Volume, NDArray[np.uint8]]:
-    """CT in HU (cortex of 1000 HU, 2 mm thick, around marrow of 60 HU in muscle of 50 HU) and its true labels."""
+    """CT in HU (cortex of 1000 HU, 2 mm thick, around marrow of 60 HU in muscle of 50 HU) and its true labels.
+
+    A voxel holds the mean over its width, as in a scanner, and the label of its larger part.
+    """
+    parts = [max(1, round(s / _PART_MM)) for s in spacing]
     counts = np.round((_HIGH - _LOW) / spacing).astype(int)
-    axes = [_LOW[k] + spacing[k] * (np.arange(counts[k]) + 0.5) for k in range(3)]
+    axes = [_LOW[k] + spacing[k] * (np.arange(counts[k] * parts[k]) + 0.5) / parts[k] for k in range(3)]
     z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
     off = np.stack([x, y, z], -1) - HEAD
     from_head = np.linalg.norm(off, axis=-1)
@@ -38,10 +43,19 @@ def hip_scene(spacing: tuple[float, float, float], metal: bool = False) -> tuple
         hu[np.linalg.norm(beside[..., :2], axis=-1) < 4] = 3071
         hu[off[..., 2] > 15] = np.where(labels > 0, hu, 50)[off[..., 2] > 15]
     hu[y < _LOW[1] + 8] = -1000
+    width = (parts[2], parts[1], parts[0])
+    hu = _mean(hu, width)
+    labels = sum(n * (_mean(labels == n, width) > 0.5) for n in (HIP_LEFT, FEMUR_LEFT)).astype(np.uint8)
     hu += np.random.default_rng(0).normal(0, 15, hu.shape)
-    first = [axis[0] for axis in axes]
+    first = _LOW + np.array(spacing) / 2
     affine = axis_aligned(spacing, (first[0], first[1], first[2]))
     return Volume(torch.from_numpy(hu.astype(np.float32)), affine), labels
+
+
+def _mean(values: NDArray[np.generic], width: tuple[int, int, int]) -> NDArray[np.float64]:
+    """Means over so many values along each axis."""
+    shape = [n for count, w in zip(values.shape, width, strict=True) for n in (count // w, w)]
+    return values.reshape(shape).mean((1, 3, 5))
 
 
 def shares_of(labels: NDArray[np.uint8], spacing: tuple[float, float, float], voxel_mm: float = 3.0) -> Tensor:
