@@ -272,7 +272,7 @@ def _bones(hu: Tensor, scene: _Scene, draw: _Draw) -> Tensor:
         cortex = draw.between(450, 1500) * (0.6 + 0.4 * density)
         marrow = marrow_base + draw.between(-60, 60) + draw.between(10, 110) * patches + grain
         marrow = marrow - (draw.between(0, 12) * (-d - 6).clamp(0, 15)) - shaft * draw.between(0, 250)
-        if k in _FEMORA and draw.happens(0.6):  # where the trabeculae that carry the load meet, in the middle of the head
+        if k in _FEMORA and draw.happens(0.6):  # the trabeculae that carry the load meet in the middle of the head
             middle = (scene.points - head).norm(dim=-1) / draw.between(8, 18)
             marrow = marrow + draw.between(50, 400) * (-middle.square()).exp()
         if k in (*_HIPS, *_FEMORA):
