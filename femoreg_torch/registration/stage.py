@@ -51,8 +51,8 @@ class BodyPlan:
     where it is in a stage whose images show nothing of it.
     [intrinsics] are the cameras themselves: the source distance of all views and the principal point of each, as far as
     the C-arm's file is uncertain of them. With `doubt` they move only where they were refined before, or where the
-    images, all else settled, doubt them by so many standard deviations (infinite: they are not asked): images that are
-    drawn a little wrong feign a little other intrinsics, and a C-arm's file may be right.
+    images, all else settled, doubt the file by so many standard deviations (infinite: they are not asked): images that
+    are drawn a little wrong feign a little other intrinsics, and a C-arm's file may be right.
     """
 
     move: list[str]

@@ -9,9 +9,10 @@ from registration_scenes import CARM, REFERENCE_POINTS, float64, make_scene, off
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import CameraChange, Poses, Uncertainty, rigid
-from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.optimize import LevenbergMarquardt, Quadratic
 from femoreg_torch.registration.covariance import pose_covariance
 from femoreg_torch.registration.doubts import doubts_about_the_carm
+from femoreg_torch.registration.intrinsics import doubt
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, image_quadratic, stage_objective
 from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance
@@ -31,9 +32,9 @@ def _wrong(scene: Scene, factor: float, shift_mm: tuple[float, float] = (0.0, 0.
     return replace(scene, carm=replace(CARM, camera=CARM.camera.changed(CameraChange(factor, shift_mm))))
 
 
-def _stage(doubt: float | None = None, iterations: int = 8) -> Stage:
+def _stage(waits: float | None = None, iterations: int = 8) -> Stage:
     bodies = [BodyPlan([name], *_MOVES) for name in REFERENCE_POINTS] + [BodyPlan(["views"], *_MOVES)]
-    bodies += [BodyPlan(["intrinsics"], doubt=doubt)]
+    bodies += [BodyPlan(["intrinsics"], doubt=waits)]
     optimiser = LevenbergMarquardt(max_iterations=iterations, tol_x=0.01, tol_f=1e-7)
     return Stage("all", "all", ["all"], ["all"], bodies, _LEVEL, _SIMILARITY, optimiser)
 
@@ -101,12 +102,12 @@ def _apart(poses: Poses) -> float:
 
 
 def test_a_right_file_is_not_doubted_and_stays(scene: Scene) -> None:
-    assert run_stage(scene, true_poses(), _stage(doubt=2.5, iterations=1), (0, 1, 2), 0).poses.changes == ()
+    assert run_stage(scene, true_poses(), _stage(waits=2.5, iterations=1), (0, 1, 2), 0).poses.changes == ()
 
 
 def test_a_wrong_file_is_doubted(scene: Scene) -> None:
     wrong = _wrong(scene, 1.04)
-    assert run_stage(wrong, _slid(scene, 1.04), _stage(doubt=2.5, iterations=1), (0, 1, 2), 0).poses.changes != ()
+    assert run_stage(wrong, _slid(scene, 1.04), _stage(waits=2.5, iterations=1), (0, 1, 2), 0).poses.changes != ()
 
 
 def test_a_file_that_is_not_doubted_changes_nothing(scene: Scene) -> None:
@@ -114,7 +115,7 @@ def test_a_file_that_is_not_doubted_changes_nothing(scene: Scene) -> None:
     aside = true_poses()
     for name in aside.camera1_from:
         aside = aside.with_object(name, rigid(translation=float64(1.5, -1, 2)) @ aside.camera1_from[name])
-    waiting = run_stage(scene, aside, _stage(doubt=2.5), (0, 1, 2), 0)
+    waiting = run_stage(scene, aside, _stage(waits=2.5), (0, 1, 2), 0)
     without = run_stage(scene, aside, replace(_stage(), bodies=_stage().bodies[:-1]), (0, 1, 2), 0)
     assert waiting.poses.changes == ()
     assert waiting.evaluations == without.evaluations
@@ -123,9 +124,53 @@ def test_a_file_that_is_not_doubted_changes_nothing(scene: Scene) -> None:
     assert torch.equal(waiting.poses.camera_from_camera1, without.poses.camera_from_camera1)
 
 
+def _images_that_ask(sdd: float, shifts_mm: list[tuple[float, float]]) -> Quadratic:
+    """Images of three views, 100 tiles each, whose steps of Newton along each of the intrinsics are these.
+
+    One unit is 2 % or 2 mm. Tiles of each view alone fix the source distance within 0.2 % and a shift within 2 mm; one
+    rigid degree of freedom has nothing to do with it.
+    """
+    curvature = 0.01
+    scores = torch.zeros(300, 8, dtype=torch.float64)
+    signs = torch.tensor([1.0, -1.0], dtype=torch.float64).repeat(50)
+    for view, shift in enumerate(shifts_mm):
+        tiles = scores[100 * view : 100 * view + 100]
+        tiles[:, 1] = curvature * (-sdd / 0.02 / 100 + 0.1 * signs / 10) / 3
+        for axis, mm in enumerate(shift):
+            tiles[:, 2 + 2 * view + axis] = curvature * (-mm / 2 / 100 + signs / 10)
+    return Quadratic(0.5, scores, curvature * torch.eye(8, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("sdd", "shifts_mm", "doubted"),
+    [
+        (0.0, [(0, 0), (0, 0), (0, 0)], False),
+        (0.03, [(0, 0), (0, 0), (0, 0)], True),
+        (-0.03, [(0, 0), (0, 0), (0, 0)], True),
+        (0.0, [(0, 0), (0, 0), (0, -12)], False),  # a single view asks for what the file cannot have wrong
+        (0.0, [(8, 0), (-12, 0), (6, 0)], False),
+        (0.0, [(12, 0), (12, 0), (12, 0)], True),
+        (0.0, [(0, -12), (0, -12), (0, -12)], True),
+    ],
+)
+def test_the_file_is_doubted_where_all_views_ask_alike(
+    scene: Scene, sdd: float, shifts_mm: list[tuple[float, float]], doubted: bool
+) -> None:
+    refined = intrinsics_of(scene, true_poses(), _ALL)
+    assert (doubt(_images_that_ask(sdd, shifts_mm), refined) > 3) == doubted
+
+
+def test_what_the_file_holds_is_not_doubted(scene: Scene) -> None:
+    sure = Uncertainty(sdd_percent=0.0, principal_point_mm=0.0)
+    held = replace(scene, carm=replace(CARM, uncertainty=sure))
+    model = _images_that_ask(0.03, [(12, 12)] * 3)
+    rigid = Quadratic(model.value, model.scores[:, :1], model.hessian[:1, :1])
+    assert doubt(rigid, intrinsics_of(held, true_poses(), _ALL)) == 0.0
+
+
 def test_a_stage_that_does_not_ask_refines_what_was_refined_before(scene: Scene) -> None:
     wrong, start = _wrong(scene, 1.04), _slid(scene, 1.04)
-    silent = _stage(doubt=math.inf, iterations=1)
+    silent = _stage(waits=math.inf, iterations=1)
     assert run_stage(wrong, start, silent, (0, 1, 2), 0).poses.changes == ()
     begun = start.with_changes((CameraChange(1 / 1.02),) * 3)
     after = run_stage(wrong, begun, silent, (0, 1, 2), 0).poses.changes
@@ -135,7 +180,7 @@ def test_a_stage_that_does_not_ask_refines_what_was_refined_before(scene: Scene)
 
 def test_a_stage_that_goes_on_with_free_intrinsics_counts_both_parts(scene: Scene) -> None:
     wrong, start = _wrong(scene, 1.04), _slid(scene, 1.04)
-    record = run_stage(wrong, start, _stage(doubt=2.5, iterations=1), (0, 1, 2), 0)
+    record = run_stage(wrong, start, _stage(waits=2.5, iterations=1), (0, 1, 2), 0)
     assert record.evaluations == 4  # a start and a step each
     counted = [moment.evaluations for moment in record.moments]
     assert counted == sorted(counted)
@@ -171,9 +216,9 @@ def test_a_file_far_from_what_the_images_fit_is_told(scene: Scene) -> None:
     wrong = _wrong(scene, 1.10)
     poses = true_poses().with_changes((CameraChange(1 / 1.10),) * 3)
     covariance = final_covariance(wrong, poses)
-    (doubt,) = doubts_about_the_carm(wrong, poses, covariance, Limits())
-    assert "the C-arm's file says 1122 mm" in doubt
-    assert "a source distance of 10" in doubt
+    (told,) = doubts_about_the_carm(wrong, poses, covariance, Limits())
+    assert "the C-arm's file says 1122 mm" in told
+    assert "a source distance of 10" in told
     camera = assess_cameras(wrong, poses, covariance)[0]
     assert camera.sdd_mm == pytest.approx(1020)
     assert 0 < camera.sdd_deviation_mm < 0.02 * 1020
@@ -188,7 +233,7 @@ def test_a_principal_point_that_refinement_moved_far_is_told(scene: Scene, shift
     still, shifted = CameraChange(), CameraChange(principal_point_shift_mm=(0.3, -shift_mm))
     told = doubts_about_the_carm(scene, poses.with_changes((still, shifted, still)), covariance, Limits())
     assert len(told) == doubted
-    assert all("principal point of view 2 by 2.4 mm" in doubt for doubt in told)
+    assert all("principal point of view 2 by 2.4 mm" in sentence for sentence in told)
 
 
 def test_a_wrong_file_that_was_not_refined_is_not_trusted(scene: Scene) -> None:
