@@ -93,7 +93,7 @@ def test_material_and_pose_of_a_device_that_is_told_as_one_solid(mixed: Scene) -
     assert fit is not None
     deg, mm = pose_difference(poses().camera1_from["device"], fit.camera1_from, POINT)
     assert mm < 0.3
-    assert deg < 0.6
+    assert deg < 0.75  # 0.37 to 0.65 over seven starts near this one; which of them it is changes with the machine
     assert min(fit.attenuations) == pytest.approx(LIGHT, rel=0.25)
     assert max(fit.attenuations) > 6 * LIGHT
     of_rod, of_handle = (fit.volume.data[part.data > 0].median() for part in (ROD, HANDLE))
