@@ -198,9 +198,18 @@ def _sides_of_the_crest(found: Mask, bone: NDArray[np.float32], region: _Region)
     markers = np.where(sure > 0, 1, np.where(none, 2, 0)) * band
     smooth = ndimage.gaussian_filter(region.hu.numpy(), _CREST_MM / region.spacing[::-1])
     side = watershed(smooth, markers, mask=band)
-    # Where both meet is the crest itself, which its brightness judges. Without anything surely within, a crest has one
-    # side only, and says nothing.
-    return (side == 1) & ~ndimage.binary_dilation(side == 2), (side == 2) & (ndimage.maximum_filter(sure, around) > 0)
+    # Where both meet is the crest itself, which its brightness judges. If it is no brighter than what lies within,
+    # there is no crest: such is the dense middle of a femoral head of which the network cut off the rest.
+    meeting = (side == 1) & ndimage.binary_dilation(side == 2)
+    crest = _mean_near(smooth, meeting, around) > _mean_near(smooth, sure > 0, around)
+    return (side == 1) & ~meeting, (side == 2) & crest
+
+
+def _mean_near(values: NDArray[np.float32], there: Mask, size: list[int]) -> NDArray[np.float32]:
+    """Mean in a box around each voxel of the values that are there; NaN without any."""
+    share = ndimage.uniform_filter(there.astype(np.float32), size, mode="constant")
+    total = ndimage.uniform_filter(values * there, size, mode="constant")
+    return np.where(share > 0.5 / np.prod(size), total, np.nan) / np.maximum(share, 1e-9)
 
 
 def _trimmed(
