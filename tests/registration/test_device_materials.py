@@ -157,7 +157,9 @@ def test_without_images_of_the_device_there_is_nothing_to_do(mixed: Scene) -> No
 
 def test_logarithms_of_unknown_base_do_not_tell_materials(mixed: Scene) -> None:
     """Grey values of 12 bits, as an image whose header says `LOG` alone, or a case `intensity: log`, may hold."""
-    grey = {kind: tuple(600 * image for image in of if image is not None) for kind, of in mixed.images.items()}
+    grey: dict[str, tuple[torch.Tensor | None, ...]] = {
+        kind: tuple(600 * image for image in of if image is not None) for kind, of in mixed.images.items()
+    }
     left_out = Calibration("materials").left_out(replace(mixed, images=grey), poses())
     assert "unknown base" in (left_out or "")
 
