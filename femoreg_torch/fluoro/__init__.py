@@ -5,7 +5,7 @@ from femoreg_torch.fluoro.dicom import Frames, carm_settings, read_header
 from femoreg_torch.fluoro.display import SOURCES, TURNS, Display, Source
 from femoreg_torch.fluoro.distortion import Distortion, GridImage, find_distortion, find_grid_spots
 from femoreg_torch.fluoro.field import Circle, Polygon
-from femoreg_torch.fluoro.intensity import attenuation_image, binned, downsample
+from femoreg_torch.fluoro.intensity import attenuation_image, binned, downsample, natural
 from femoreg_torch.fluoro.reading import (
     StoredImage,
     check_matches,
@@ -42,6 +42,7 @@ __all__ = [
     "find_grid_spots",
     "find_shutter",
     "may_be_image",
+    "natural",
     "nearest_side",
     "read_header",
     "read_image",

@@ -35,12 +35,19 @@ def downsample(image: Tensor, factor: int) -> Tensor:
     return coarse.reshape(*image.shape[:-2], *coarse.shape[-2:])
 
 
+def natural(attenuation: Tensor) -> bool:
+    """Whether an attenuation image (H, W) may hold natural logarithms of intensities.
+
+    Where half of it is darker than any patient, they are logarithms of another base, or grey values.
+    """
+    return bool(attenuation[::_SPARSE, ::_SPARSE].median() - attenuation.min() <= _MOST_ATTENUATION)
+
+
 def binned(attenuation: Tensor, factor: int) -> Tensor:
     """An attenuation image (H, W) as a detector with pixels so many times larger sees it, (H // factor, W // factor).
 
-    Such pixels average intensities. Where half of the image is darker than any patient, the values are no natural
-    logarithms of intensities (but grey values, say) and are averaged themselves.
+    Such pixels average intensities. Values that are not `natural` are averaged themselves.
     """
-    if attenuation[::_SPARSE, ::_SPARSE].median() - attenuation.min() > _MOST_ATTENUATION:
+    if not natural(attenuation):
         return downsample(attenuation, factor)
     return -downsample((-attenuation).clamp(-_EXTREME, _EXTREME).exp(), factor).log()

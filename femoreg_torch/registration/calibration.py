@@ -4,6 +4,7 @@ import time
 from dataclasses import dataclass, replace
 
 from femoreg_torch.case.trace import StageRecord
+from femoreg_torch.fluoro import natural
 from femoreg_torch.geometry import Poses, pose_difference
 from femoreg_torch.registration.device_fit import fit_device
 from femoreg_torch.registration.scene import Kind, Scene
@@ -20,8 +21,12 @@ class Calibration:
 
     def left_out(self, scene: Scene, poses: Poses) -> str | None:
         """Why it has nothing to do, see `Step`."""
-        if not devices(scene, poses):
+        shown = devices(scene, poses)
+        if not shown:
             return "no device is shown by one kind of images and missing in the first kind"
+        kinds = [scene.first_kind, *{kind: None for _, kind in shown}]
+        if not all(natural(scene.image(kind, view)) for kind, view in scene.there(kinds, range(scene.views))):
+            return "the images hold logarithms of unknown base, or grey values, which do not tell materials"
         return None
 
     def calibrate(self, scene: Scene, poses: Poses) -> tuple[Scene, StageRecord]:

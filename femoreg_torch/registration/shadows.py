@@ -110,11 +110,12 @@ def views_of(
             covered = dilated(covered, _AROUND_MM, camera)
         intensities = []
         for k in (scene.first_kind, device.kind):
-            image = LEVEL.image(scene.image(k, view), scene.carm.camera)
+            stored = scene.image(k, view)
+            image = LEVEL.image(stored, scene.carm.camera)
             intensities.append((-image.cpu()).exp().flatten().double().numpy())
             field = scene.field(k, view)
-            if field is not None:
-                covered &= LEVEL.field(field, scene.carm.camera).cpu()
+            told = stored > (stored if field is None else stored[field]).amin()  # a saturated pixel hides shadows
+            covered &= LEVEL.field(told if field is None else told & field, scene.carm.camera).cpu()
         chosen = np.flatnonzero(covered.flatten().numpy())
         changes = np.zeros((len(chosen), 6))
         if volume is not None:

@@ -59,11 +59,14 @@ def poses(motion: torch.Tensor | None = None) -> Poses:
     return Poses(CARM.orbit(angles), {"body": body, "device": device})
 
 
-def make_scene(rod: float, handle: float) -> Scene:
-    """A block of tissue, and before it the device: intensities with a constant scatter, rays four times as fine."""
+def make_scene(rod: float, handle: float, tissue_from: float = -118.0, brightest: float = 2.0) -> Scene:
+    """A block of tissue, and before it the device: intensities with a constant scatter, rays four times as fine.
+
+    The tissue begins at x = `tissue_from`; the detector saturates at `brightest`.
+    """
     fine = centred_camera(1000.0, (0.375, 0.375), (640, 640))
     truth = poses()
-    block = Volume(torch.full((30, 60, 60), 0.02), axis_aligned((4.0, 4.0, 2.0), (-118.0, -118.0, -29.0)))
+    block = Volume(torch.full((30, 60, 60), 0.02), axis_aligned((4.0, 4.0, 2.0), (tissue_from, -118.0, -29.0)))
     alone, together = [], []
     for view in range(3):
         body = project(block, truth.camera_from("body")[view][None], fine, 1.0)[0]
@@ -71,7 +74,7 @@ def make_scene(rod: float, handle: float) -> Scene:
         light = project(HANDLE, truth.camera_from("device")[view][None], fine, 0.2)[0]
         through = torch.stack([torch.exp(-share * rod * metal) for share in SPECTRUM.tolist()]).mean(0)
         for images, device in ((alone, torch.ones_like(metal)), (together, through * torch.exp(-handle * light))):
-            intensity = torch.exp(-body) * device + SCATTERED
+            intensity = (torch.exp(-body) * device + SCATTERED).clamp_max(brightest)
             images.append(-torch.nn.functional.avg_pool2d(intensity[None], 4)[0].log())
     device = ROD.with_data((ROD.data + HANDLE.data).clamp_max(1) * 0.161)  # one bare HU for all
     objects = {
@@ -118,6 +121,16 @@ def test_a_device_that_is_as_the_case_says_stays_so() -> None:
     assert "/mm" in record.stop
 
 
+def test_saturated_pixels_tell_nothing_of_a_part_before_them() -> None:
+    """The handle lies before open air in two views, where both images are as bright as the detector goes."""
+    scene = make_scene(METAL, LIGHT, tissue_from=-5.0, brightest=0.4)
+    fit = fit_device(scene, poses(), "device", "device")
+    assert fit is not None
+    of_rod, of_handle = (fit.volume.data[part.data > 0].median() for part in (ROD, HANDLE))
+    assert of_handle == pytest.approx(LIGHT, rel=0.25)
+    assert of_rod > 5 * of_handle
+
+
 def test_named_parts_keep_their_bounds(mixed: Scene) -> None:
     """Each named part is one material, whatever is told of it; here both are told wrong."""
     parts = (ROD.with_data(ROD.data * 0.3), HANDLE.with_data((HANDLE.data - ROD.data).clamp_min(0) * 0.1))
@@ -140,6 +153,15 @@ def test_without_images_of_the_device_there_is_nothing_to_do(mixed: Scene) -> No
     alone = replace(mixed, images={"anatomy": mixed.images["anatomy"]})
     assert "no device" in (Calibration("materials").left_out(alone, poses()) or "")
     assert Calibration("materials").left_out(mixed, poses()) is None
+
+
+def test_logarithms_of_unknown_base_do_not_tell_materials(mixed: Scene) -> None:
+    """Grey values of 12 bits, as an image whose header says `LOG` alone, or a case `intensity: log`, may hold."""
+    grey: dict[str, tuple[torch.Tensor | None, ...]] = {
+        kind: tuple(600 * image for image in of if image is not None) for kind, of in mixed.images.items()
+    }
+    left_out = Calibration("materials").left_out(replace(mixed, images=grey), poses())
+    assert "unknown base" in (left_out or "")
 
 
 def test_paths_through_regions_are_those_of_the_projector() -> None:
