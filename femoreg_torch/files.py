@@ -104,6 +104,8 @@ def new_folder(path: Path, without: Collection[str] = ()) -> Iterator[Path]:
         built = workshop / _NEW / path.name
         built.mkdir()
         yield built
+        for left in list(built.rglob(f".*.{_RANDOM_PART}{_SUFFIX}")):  # of files in it: what could not be removed there
+            shutil.rmtree(left)
         if path.exists():
             _keep_others(path, built, without)
         _put_in_place(built, path, workshop / _OLD)

@@ -1,11 +1,13 @@
 """Nothing half-written is left behind, whenever a run is killed, and nothing else is touched."""
 
+import errno
 import json
 import os
 import random
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +63,33 @@ def test_a_full_disk_is_told_with_the_name(tmp_path: Path) -> None:
         write_text(tmp_path / "a.txt", "a" * 1000)
     assert raised.value.filename == str(tmp_path / "a.txt")
     assert names(tmp_path) == []
+
+
+def test_what_a_file_left_behind_in_a_new_folder_does_not_come_along(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failed, unlink, rmdir = [], os.unlink, os.rmdir
+
+    def fails_once(real: Callable[..., None]) -> Callable[..., None]:
+        def remove(path: Path | str, **where: int) -> None:
+            if not failed:
+                failed.append(path)
+                raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+            real(path, **where)
+
+        return remove
+
+    for name, real in (("unlink", unlink), ("rmdir", rmdir)):
+        failed.clear()
+        monkeypatch.setattr(os, name, fails_once(real))
+        with new_folder(tmp_path / "run") as built:
+            (built / "deep").mkdir()
+            write_text(built / "deep" / "result.json", "{}")
+            assert failed
+        monkeypatch.setattr(os, name, real)
+        assert [str(p.relative_to(tmp_path)) for p in sorted(tmp_path.rglob("*"))] == [
+            "run", "run/deep", "run/deep/result.json"
+        ]  # fmt: skip
 
 
 def test_only_what_was_built_is_replaced(tmp_path: Path) -> None:
