@@ -197,7 +197,7 @@ def _workshop(path: Path) -> Iterator[Path]:
     What killed writers of `path` left is removed first. They are told from live ones by the lock, which the system
     takes from a process that ends.
     """
-    _clear_leftovers(path)
+    clear_leftovers(path)
     while True:
         workshop = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=_SUFFIX, dir=path.parent))
         try:
@@ -224,8 +224,11 @@ def _workshop(path: Path) -> Iterator[Path]:
         os.close(lock)
 
 
-def _clear_leftovers(path: Path) -> None:
-    """Remove the workshops of killed writers of `path`; a folder that one had renamed away is brought back first."""
+def clear_leftovers(path: Path) -> None:
+    """Remove the workshops of killed writers of `path`; a folder that one had renamed away is brought back first.
+
+    Whoever writes `path` does so anyway; this is for one that is not written anew because it is there.
+    """
     for left in path.parent.glob(f".{glob.escape(path.name)}.{_RANDOM_PART}{_SUFFIX}"):
         try:
             lock = os.open(left / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)

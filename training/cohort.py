@@ -13,6 +13,7 @@ import numpy as np
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import network_camera
 from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.files import clear_leftovers
 from femoreg_torch.geometry import load_carm
 from femoreg_torch.settings import SEEDS, check_within
 from femoreg_torch.tensors import read_metadata
@@ -125,6 +126,7 @@ def _variants(
     source = json.dumps({"patient": name, **how})
     for file in files:
         if file.exists():
+            clear_leftovers(file)
             _check_source(file, source)
     missing = [variant for variant, file in enumerate(files) if not file.exists()]
     if not missing:

@@ -1,6 +1,7 @@
 """One training run from settings to exported weights."""
 
 import json
+import logging
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -80,6 +81,7 @@ def train_network(
         resumed = last_good_checkpoint(last.parent, like, console.print)
     elif start is not None:
         begin_with(start, settings.network.build())  # complains before anything is rendered
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # or advice of its own stands on stderr
     torch.set_num_threads(run.threads)
     cohort = render_cohort(run.cohort, cases, cache, console.print)
     for name in () if resume else (_CSV, _TENSORBOARD):  # of a run that was killed before its first checkpoint

@@ -1,6 +1,7 @@
 """`femoreg train` on a disk that fails at the n-th step: one line, and the next start goes on or begins anew."""
 
 import json
+import logging
 import shutil
 from pathlib import Path
 
@@ -65,6 +66,26 @@ def failing_at(n: int, prepared: list[str], out: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize("n", [1, 3, 9])
 def test_a_step_that_fails(n: int, prepared: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert failing_at(n, prepared, tmp_path / "out", capsys)
+
+
+def test_what_a_killed_run_left_beside_views_that_are_whole_is_removed(prepared: list[str], tmp_path: Path) -> None:
+    (view,) = Path(prepared[-1]).glob("*_00.safetensors")
+    left = view.with_name(f".{view.name}.abcd1234.part")
+    (left / "new").mkdir(parents=True)
+    assert main([*prepared, "--out", str(tmp_path / "out")]) == 0
+    assert not left.exists()
+
+
+def test_nothing_of_what_lightning_tells_stands_on_stderr(prepared: list[str], tmp_path: Path) -> None:
+    told: list[str] = []
+    ear = logging.Handler(logging.INFO)
+    ear.emit = lambda record: told.append(record.getMessage())  # type: ignore[method-assign]
+    logging.getLogger("lightning.pytorch").addHandler(ear)
+    try:
+        assert main([*prepared, "--out", str(tmp_path / "out")]) == 0
+    finally:
+        logging.getLogger("lightning.pytorch").removeHandler(ear)
+    assert told == []
 
 
 def test_a_case_that_lacks_a_landmark(case: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
