@@ -26,9 +26,9 @@ from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import load_network
 from femoreg_torch.detect.grid import NETWORK_SIZE
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import temporary_file, write_json
+from femoreg_torch.files import clear_leftovers, temporary_file, write_json
 from models.weights import SHIPPED_WEIGHTS, Weights, save_weights
-from training.checkpoints import last_good_checkpoint, read_checkpoint
+from training.checkpoints import WholeCheckpoints, last_good_checkpoint, read_checkpoint
 from training.cohort import render_cohort
 from training.curves import draw_curves
 from training.data import ViewData
@@ -86,6 +86,8 @@ def train_network(
     cohort = render_cohort(run.cohort, cases, cache, console.print)
     for name in () if resume else (_CSV, _TENSORBOARD):  # of a run that was killed before its first checkpoint
         shutil.rmtree(out / name, ignore_errors=True)
+    for name in ("best.ckpt", "last.ckpt"):  # of a run that was killed while it wrote them
+        clear_leftovers(last.with_name(name))
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "settings.json", {**settings.as_content(), "cases": [case.resolve().name for case in cases]})
     seed_everything(run.seed, verbose=False)
@@ -123,6 +125,7 @@ def train_network(
         use_distributed_sampler=False,
         logger=[CSVLogger(out, _CSV), TensorBoardLogger(out, _TENSORBOARD, version="")],
         callbacks=callbacks,
+        plugins=[WholeCheckpoints()],
         enable_model_summary=False,
         log_every_n_steps=min(25, optimisation.batches_per_epoch),
         limit_val_batches=1.0 if cohort.validation else 0,

@@ -88,6 +88,18 @@ def test_nothing_of_what_lightning_tells_stands_on_stderr(prepared: list[str], t
     assert told == []
 
 
+def test_checkpoints_do_not_come_from_another_disk(
+    prepared: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved: list[str] = []
+    monkeypatch.setattr(shutil, "move", lambda source, target, *_, **__: moved.append(f"{source} to {target}"))
+    left = tmp_path / "out" / "checkpoints" / ".best.ckpt.abcd1234.part"
+    left.mkdir(parents=True)
+    assert main([*prepared, "--out", str(tmp_path / "out")]) == 0
+    assert moved == []
+    assert sorted(path.name for path in left.parent.iterdir()) == ["best.ckpt", "last.ckpt"]
+
+
 def test_a_case_that_lacks_a_landmark(case: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(case, tmp_path / "case")
     path = tmp_path / "case" / "landmarks.json"
