@@ -19,6 +19,7 @@ from femoreg_torch import files
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import (
     check_new_folder,
+    clear_leftovers,
     new_folder,
     read_json,
     temporary_file,
@@ -263,6 +264,19 @@ def test_killed_at_any_moment_a_writer_leaves_files_that_agree(tmp_path: Path, w
             (built / "notes.txt").write_text("mine")
         assert (run / "result.json").read_text() == (run / "deep" / "navigation.json").read_text()
         assert names(tmp_path) == ["run"]
+
+
+def test_a_folder_is_cleared_of_what_killed_writers_left_of_anything_in_it(tmp_path: Path) -> None:
+    (tmp_path / ".gone.abcd1234.part" / "old").mkdir(parents=True)
+    (tmp_path / ".gone.abcd1234.part" / "old" / "result.json").write_text("{}")
+    (tmp_path / ".kept.abcd1234.part" / "old").mkdir(parents=True)
+    (tmp_path / "kept").mkdir()
+    (tmp_path / ".notes.part").mkdir()
+    with new_folder(tmp_path / "live") as built:
+        clear_leftovers(tmp_path)
+        (built / "result.json").write_text("{}")
+    assert names(tmp_path) == [".notes.part", "gone", "kept", "live"]
+    assert names(tmp_path / "gone") == names(tmp_path / "live") == ["result.json"]
 
 
 def test_what_a_live_writer_builds_is_not_taken_for_a_leftover(tmp_path: Path) -> None:

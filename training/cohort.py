@@ -78,6 +78,7 @@ def render_cohort(
     made with other settings.
     """
     cache.mkdir(parents=True, exist_ok=True)
+    clear_leftovers(cache)
     training: list[Path] = []
     for case in cases:
         name = case.resolve().name
@@ -126,7 +127,6 @@ def _variants(
     source = json.dumps({"patient": name, **how})
     for file in files:
         if file.exists():
-            clear_leftovers(file)
             _check_source(file, source)
     missing = [variant for variant, file in enumerate(files) if not file.exists()]
     if not missing:

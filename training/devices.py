@@ -8,7 +8,7 @@ from torch import Tensor
 
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.files import clear_leftovers, temporary_file
+from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera
 from femoreg_torch.tensors import read_metadata, read_tensors, write_tensors
 from sim.labelled.devices_in_view import device_pose
@@ -30,7 +30,6 @@ def render_devices(path: Path, count: int, camera: Camera, seed: int) -> Path:
     """
     source = f"{count} devices on {camera.shape}, seed {seed}, {_RANGES}"
     if path.exists():
-        clear_leftovers(path)
         found = read_metadata(path).get("source")
         if found != source:
             raise InputError(

@@ -86,8 +86,7 @@ def train_network(
     cohort = render_cohort(run.cohort, cases, cache, console.print)
     for name in () if resume else (_CSV, _TENSORBOARD):  # of a run that was killed before its first checkpoint
         shutil.rmtree(out / name, ignore_errors=True)
-    for name in ("best.ckpt", "last.ckpt"):  # of a run that was killed while it wrote them
-        clear_leftovers(last.with_name(name))
+    clear_leftovers(last.parent)
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "settings.json", {**settings.as_content(), "cases": [case.resolve().name for case in cases]})
     seed_everything(run.seed, verbose=False)
