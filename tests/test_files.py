@@ -69,7 +69,8 @@ def test_a_full_disk_is_told_with_the_name(tmp_path: Path) -> None:
 def test_what_a_file_left_behind_in_a_new_folder_does_not_come_along(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    failed, unlink, rmdir = [], os.unlink, os.rmdir
+    failed: list[Path | str] = []
+    unlink, rmdir = os.unlink, os.rmdir
 
     def fails_once(real: Callable[..., None]) -> Callable[..., None]:
         def remove(path: Path | str, **where: int) -> None:
