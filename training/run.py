@@ -129,7 +129,12 @@ def train_network(
         log_every_n_steps=min(25, optimisation.batches_per_epoch),
         limit_val_batches=1.0 if cohort.validation else 0,
     )
-    trainer.fit(module, data, ckpt_path=resumed)
+    try:
+        trainer.fit(module, data, ckpt_path=resumed)
+    except OSError as error:
+        if error.filename is None and error.errno is not None:  # the system does not say for which file
+            raise OSError(error.errno, error.strerror, str(out)) from error
+        raise
     if not trainer.is_global_zero:  # one process writes
         return out / SHIPPED_WEIGHTS
     draw_curves(out / _TENSORBOARD, out / "curves.png")

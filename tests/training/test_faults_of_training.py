@@ -1,12 +1,16 @@
 """`femoreg train` on a disk that fails at the n-th step: one line, and the next start goes on or begins anew."""
 
+import errno
 import json
 import logging
+import os
 import shutil
+import threading
 from pathlib import Path
 
 import pytest
 from fuzz_faults import FAULT, fault
+from tensorboard.summary.writer.record_writer import RecordWriter
 
 from femoreg_torch.commands.main import main
 from femoreg_torch.detect import load_network
@@ -86,6 +90,19 @@ def test_nothing_of_what_lightning_tells_stands_on_stderr(prepared: list[str], t
     finally:
         logging.getLogger("lightning.pytorch").removeHandler(ear)
     assert told == []
+
+
+@pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_disk_that_is_full_for_a_thread_of_logs_is_told_once(
+    prepared: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(RecordWriter, "write", full)
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)  # to be given back
+    assert main([*prepared, "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err == f"femoreg: {tmp_path / 'out'}: No space left on device.\n"
 
 
 def test_checkpoints_do_not_come_from_another_disk(
