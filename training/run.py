@@ -68,6 +68,8 @@ def train_network(
     false, or has none to resume, or if `start` does not fit.
     """
     console = Console()
+    if any("\ud800" <= letter <= "\udfff" for letter in str(out)):  # how Python holds bytes that are no letters
+        raise InputError(f"{out}: the name of this folder is not UTF-8, which logs need. Choose another one.")
     last = out / "checkpoints" / "last.ckpt"
     if resume and not any(last.parent.glob("*.ckpt")):
         raise InputError(f"{last}: no such file, so there is nothing to resume. Leave out --resume.")

@@ -242,7 +242,7 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
         raise InputError(f"{name}: {key}{colon}{rest}. See `femoreg {name} --help`.") from error
     for key, (low, high) in _RANGES.items():
         if isinstance(value := values.get(key), int | float) and not low <= value <= high:
-            raise InputError(f"{name}: --{key.replace('_', '-')}: {low:g} to {high:g} was expected, found {value:g}.")
+            raise InputError(f"{name}: --{key.replace('_', '-')}: {low} to {high} was expected, found {value}.")
     return {key: values[key] for key in get_type_hints(function) if key != "return"}
 
 

@@ -105,6 +105,14 @@ def test_a_disk_that_is_full_for_a_thread_of_logs_is_told_once(
     assert capsys.readouterr().err == f"femoreg: {tmp_path / 'out'}: No space left on device.\n"
 
 
+def test_a_folder_whose_name_logs_cannot_hold(
+    prepared: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*prepared, "--out", str(tmp_path / "out\udcff")]) == 2
+    assert "is not UTF-8" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_checkpoints_do_not_come_from_another_disk(
     prepared: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
