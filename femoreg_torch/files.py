@@ -104,6 +104,8 @@ def new_folder(path: Path, without: Collection[str] = ()) -> Iterator[Path]:
         built = workshop / _NEW / path.name
         built.mkdir()
         yield built
+        for left in list(built.rglob(f".*.{_RANDOM_PART}{_SUFFIX}")):  # of files in it: what could not be removed there
+            shutil.rmtree(left)
         if path.exists():
             _keep_others(path, built, without)
         _put_in_place(built, path, workshop / _OLD)
@@ -195,7 +197,7 @@ def _workshop(path: Path) -> Iterator[Path]:
     What killed writers of `path` left is removed first. They are told from live ones by the lock, which the system
     takes from a process that ends.
     """
-    _clear_leftovers(path)
+    clear_leftovers(path.parent, path.name)
     while True:
         workshop = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=_SUFFIX, dir=path.parent))
         try:
@@ -222,9 +224,14 @@ def _workshop(path: Path) -> Iterator[Path]:
         os.close(lock)
 
 
-def _clear_leftovers(path: Path) -> None:
-    """Remove the workshops of killed writers of `path`; a folder that one had renamed away is brought back first."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.{_RANDOM_PART}{_SUFFIX}"):
+def clear_leftovers(folder: Path, name: str | None = None) -> None:
+    """Remove the workshops of killed writers in `folder`, or those of `name` in it alone.
+
+    A folder that one had renamed away is brought back first. Whoever writes a file or folder begins with this; what is
+    kept because it is there already needs it too.
+    """
+    for left in folder.glob(f".{'*' if name is None else glob.escape(name)}.{_RANDOM_PART}{_SUFFIX}"):
+        path = folder / left.name[1 : -len(f".{_RANDOM_PART}{_SUFFIX}")]
         try:
             lock = os.open(left / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
         except OSError:  # gone meanwhile, or another user's

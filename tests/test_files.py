@@ -1,11 +1,13 @@
 """Nothing half-written is left behind, whenever a run is killed, and nothing else is touched."""
 
+import errno
 import json
 import os
 import random
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from femoreg_torch import files
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import (
     check_new_folder,
+    clear_leftovers,
     new_folder,
     read_json,
     temporary_file,
@@ -61,6 +64,34 @@ def test_a_full_disk_is_told_with_the_name(tmp_path: Path) -> None:
         write_text(tmp_path / "a.txt", "a" * 1000)
     assert raised.value.filename == str(tmp_path / "a.txt")
     assert names(tmp_path) == []
+
+
+def test_what_a_file_left_behind_in_a_new_folder_does_not_come_along(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failed: list[Path | str] = []
+    unlink, rmdir = os.unlink, os.rmdir
+
+    def fails_once(real: Callable[..., None]) -> Callable[..., None]:
+        def remove(path: Path | str, **where: int) -> None:
+            if not failed:
+                failed.append(path)
+                raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+            real(path, **where)
+
+        return remove
+
+    for name, real in (("unlink", unlink), ("rmdir", rmdir)):
+        failed.clear()
+        monkeypatch.setattr(os, name, fails_once(real))
+        with new_folder(tmp_path / "run") as built:
+            (built / "deep").mkdir()
+            write_text(built / "deep" / "result.json", "{}")
+            assert failed
+        monkeypatch.setattr(os, name, real)
+        assert [str(p.relative_to(tmp_path)) for p in sorted(tmp_path.rglob("*"))] == [
+            "run", "run/deep", "run/deep/result.json"
+        ]  # fmt: skip
 
 
 def test_only_what_was_built_is_replaced(tmp_path: Path) -> None:
@@ -234,6 +265,19 @@ def test_killed_at_any_moment_a_writer_leaves_files_that_agree(tmp_path: Path, w
             (built / "notes.txt").write_text("mine")
         assert (run / "result.json").read_text() == (run / "deep" / "navigation.json").read_text()
         assert names(tmp_path) == ["run"]
+
+
+def test_a_folder_is_cleared_of_what_killed_writers_left_of_anything_in_it(tmp_path: Path) -> None:
+    (tmp_path / ".gone.abcd1234.part" / "old").mkdir(parents=True)
+    (tmp_path / ".gone.abcd1234.part" / "old" / "result.json").write_text("{}")
+    (tmp_path / ".kept.abcd1234.part" / "old").mkdir(parents=True)
+    (tmp_path / "kept").mkdir()
+    (tmp_path / ".notes.part").mkdir()
+    with new_folder(tmp_path / "live") as built:
+        clear_leftovers(tmp_path)
+        (built / "result.json").write_text("{}")
+    assert names(tmp_path) == [".notes.part", "gone", "kept", "live"]
+    assert names(tmp_path / "gone") == names(tmp_path / "live") == ["result.json"]
 
 
 def test_what_a_live_writer_builds_is_not_taken_for_a_leftover(tmp_path: Path) -> None:

@@ -1,16 +1,36 @@
-"""Checkpoints of a run that is resumed: the newest that is whole and fits the network."""
+"""Checkpoints that are written whole, and of a run that is resumed, the newest that is whole and fits the network."""
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import nn
 
 from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError
+from femoreg_torch.files import temporary_file
 
 _STATE = ("epoch", "loops", "optimizer_states", "lr_schedulers")  # what Lightning goes on from, beside the weights
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Writes checkpoints whole or not at all.
+
+    Lightning itself writes into the system's folder for temporary files. Where that is another disk, the file is then
+    copied, and a run that is killed meanwhile leaves half of its only checkpoint.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write `checkpoint` to `path`, a file."""
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        file = Path(path)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with temporary_file(file) as part:
+            part.write_bytes(content.getbuffer())
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

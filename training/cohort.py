@@ -13,6 +13,7 @@ import numpy as np
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import network_camera
 from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.files import clear_leftovers
 from femoreg_torch.geometry import load_carm
 from femoreg_torch.settings import SEEDS, check_within
 from femoreg_torch.tensors import read_metadata
@@ -77,6 +78,7 @@ def render_cohort(
     made with other settings.
     """
     cache.mkdir(parents=True, exist_ok=True)
+    clear_leftovers(cache)
     training: list[Path] = []
     for case in cases:
         name = case.resolve().name

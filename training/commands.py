@@ -1,5 +1,6 @@
 """The commands `femoreg train` and `femoreg measure`."""
 
+import threading
 from pathlib import Path
 from typing import Literal
 
@@ -40,6 +41,7 @@ def train(
     from femoreg_torch.commands.telling import tell_device
 
     place = tell_device(Console(), device)
+    threading.excepthook = _told_once
     from training.run import Machine, train_network  # takes seconds
     from training.settings import read_settings
 
@@ -47,6 +49,12 @@ def train(
     train_network(
         read_settings(settings, override or []), cases or [], out, cache or out / "cache", start, resume, machine
     )
+
+
+def _told_once(failed: threading.ExceptHookArgs) -> None:
+    """TensorBoard writes in a thread, and raises what fails there once more where the next value is logged."""
+    if not issubclass(failed.exc_type, OSError):
+        threading.__excepthook__(failed)
 
 
 def measure(

@@ -1,6 +1,7 @@
 """One training run from settings to exported weights."""
 
 import json
+import logging
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,9 +26,9 @@ from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import load_network
 from femoreg_torch.detect.grid import NETWORK_SIZE
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import temporary_file, write_json
+from femoreg_torch.files import clear_leftovers, temporary_file, write_json
 from models.weights import SHIPPED_WEIGHTS, Weights, save_weights
-from training.checkpoints import last_good_checkpoint, read_checkpoint
+from training.checkpoints import WholeCheckpoints, last_good_checkpoint, read_checkpoint
 from training.cohort import render_cohort
 from training.curves import draw_curves
 from training.data import ViewData
@@ -67,6 +68,8 @@ def train_network(
     false, or has none to resume, or if `start` does not fit.
     """
     console = Console()
+    if any("\ud800" <= letter <= "\udfff" for letter in str(out)):  # how Python holds bytes that are no letters
+        raise InputError(f"{out}: the name of this folder is not UTF-8, which logs need. Choose another one.")
     last = out / "checkpoints" / "last.ckpt"
     if resume and not any(last.parent.glob("*.ckpt")):
         raise InputError(f"{last}: no such file, so there is nothing to resume. Leave out --resume.")
@@ -80,10 +83,12 @@ def train_network(
         resumed = last_good_checkpoint(last.parent, like, console.print)
     elif start is not None:
         begin_with(start, settings.network.build())  # complains before anything is rendered
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # or advice of its own stands on stderr
     torch.set_num_threads(run.threads)
     cohort = render_cohort(run.cohort, cases, cache, console.print)
     for name in () if resume else (_CSV, _TENSORBOARD):  # of a run that was killed before its first checkpoint
         shutil.rmtree(out / name, ignore_errors=True)
+    clear_leftovers(last.parent)
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "settings.json", {**settings.as_content(), "cases": [case.resolve().name for case in cases]})
     seed_everything(run.seed, verbose=False)
@@ -121,11 +126,17 @@ def train_network(
         use_distributed_sampler=False,
         logger=[CSVLogger(out, _CSV), TensorBoardLogger(out, _TENSORBOARD, version="")],
         callbacks=callbacks,
+        plugins=[WholeCheckpoints()],
         enable_model_summary=False,
         log_every_n_steps=min(25, optimisation.batches_per_epoch),
         limit_val_batches=1.0 if cohort.validation else 0,
     )
-    trainer.fit(module, data, ckpt_path=resumed)
+    try:
+        trainer.fit(module, data, ckpt_path=resumed)
+    except OSError as error:
+        if error.filename is None and error.errno is not None:  # the system does not say for which file
+            raise OSError(error.errno, error.strerror, str(out)) from error
+        raise
     if not trainer.is_global_zero:  # one process writes
         return out / SHIPPED_WEIGHTS
     draw_curves(out / _TENSORBOARD, out / "curves.png")

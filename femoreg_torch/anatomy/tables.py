@@ -26,9 +26,14 @@ def label_table(name: str | Path) -> LabelTable:
     """
     where = f"label table {name}"
     content = load_preset(_GROUP, name)
-    if set(content) != {"anatomy", "bones"} or not isinstance(content["bones"], dict):
+    if set(content) != {"anatomy", "bones"}:
         raise InputError(
             f"{where}: the keys `anatomy` and `bones` were expected, found {', '.join(map(str, content))}."
+        )
+    if not isinstance(content["bones"], dict):
+        raise InputError(
+            f"{where}, bones: bones with their ids were expected, as in {{femur_left: 5}}, found "
+            f"{shortened(content['bones'])}."
         )
     return {str(bone): label_ids(ids, f"{where}, bones.{bone}") for bone, ids in content["bones"].items()}
 

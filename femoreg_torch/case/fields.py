@@ -111,7 +111,7 @@ class Fields:
 
     def transform(self, key: str) -> Tensor:
         """The rigid 4×4 transform, float64, under `key`."""
-        return check_rigid(self._numbers(key, (4, 4), "a 4×4 matrix"), self.where(key))
+        return check_rigid(self._numbers(key, (4, 4), "a 4×4 matrix of numbers"), self.where(key))
 
     def transform_or_file(self, key: str, folder: Path) -> Tensor:
         """The rigid 4×4 transform, float64, under `key`, or of the ITK or 3D Slicer file that stands there."""

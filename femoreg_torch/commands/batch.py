@@ -70,10 +70,12 @@ def batch(
 
     from femoreg_torch.commands.status import BAD_INPUT, DONE, NOT_TRUSTED
     from femoreg_torch.commands.telling import progress_report, tell_device
+    from femoreg_torch.files import clear_leftovers
 
     console = Console()
     waiting = _jobs(cases, out, preset, seed, weights, jobs, tell_device(console, device).type)
     out.mkdir(parents=True, exist_ok=True)
+    clear_leftovers(out)
     rows = {} if again else {job.case: row for job in waiting if (row := kept(job)) is not None}
     left = [job for job in waiting if job.case not in rows]
     with progress_report(console, f"{len(left)} cases") as report:

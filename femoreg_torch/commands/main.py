@@ -16,7 +16,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 GROUP = "femoreg_torch.commands"
 _LONGEST = 2000  # characters of a complaint
+_REQUIRED = "the following arguments are required"  # as argparse says it
 # Objects made before Python looks for rings of forgotten ones: imports make hundreds of thousands that stay. With
 # Python's own 700 the search takes a seventh of the time of `import torch`.
 _COLLECTED_AFTER = 50_000, 20, 20
@@ -232,15 +233,30 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
     try:
         values = parser.instantiate(parser.parse_args(arguments))
     except (ArgumentError, TypeError, ValueError, OSError) as error:  # OSError: a file of options that cannot be read
-        key, colon, rest = told(error).rstrip(". ").partition(":")
         known = inspect.signature(function).parameters
+        key, colon, rest = told(error).rstrip(". ").partition(":")
+        if key == _REQUIRED:
+            raise InputError(f"{name}: {_missing(name, known.values(), rest)}. See `femoreg {name} --help`.") from error
         if key in known and (known[key].kind is known[key].KEYWORD_ONLY or known[key].default is not known[key].empty):
             key = f"--{key.replace('_', '-')}"
         raise InputError(f"{name}: {key}{colon}{rest}. See `femoreg {name} --help`.") from error
     for key, (low, high) in _RANGES.items():
         if isinstance(value := values.get(key), int | float) and not low <= value <= high:
-            raise InputError(f"{name}: --{key.replace('_', '-')}: {low:g} to {high:g} was expected, found {value:g}.")
+            raise InputError(f"{name}: --{key.replace('_', '-')}: {low} to {high} was expected, found {value}.")
     return {key: values[key] for key in get_type_hints(function) if key != "return"}
+
+
+def _missing(name: str, parameters: Iterable[inspect.Parameter], named: str) -> str:
+    """What was expected, and which of it is given and which is missing: the parameters `named`, with commas."""
+    written, expected = {}, f"femoreg {name}"
+    for parameter in parameters:
+        if parameter.default is parameter.empty:
+            value, option = parameter.name.upper(), parameter.kind is parameter.KEYWORD_ONLY
+            written[parameter.name] = f"--{parameter.name.replace('_', '-')}" if option else value
+            expected += f" {written[parameter.name]} {value}" if option else f" {value}"
+    missing = named.replace(" ", "").split(",")
+    words = [f"{word} is {'missing' if key in missing else 'given'}" for key, word in written.items()]
+    return f"`{expected}` was expected; {', '.join(words)}"
 
 
 def _argument(parameter: inspect.Parameter, hint: Any) -> tuple[list[str], dict[str, Any]]:

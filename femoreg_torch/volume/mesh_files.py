@@ -123,6 +123,8 @@ def _bodies(scene: "trimesh.Scene", path: Path) -> "dict[str, trimesh.Trimesh]":
         surface = scene.geometry[geometry]
         if not isinstance(surface, trimesh.Trimesh):
             raise InputError(f"{path}: triangle meshes were expected, found {type(surface).__name__}.")
+        if surface.vertices.shape[1:] != (3,):
+            raise InputError(f"{path}: a corner lacks a coordinate. Export it anew.")
         if len(surface.faces) and (surface.faces.min() < 0 or surface.faces.max() >= len(surface.vertices)):
             raise InputError(f"{path}: a triangle has a corner that is not in the file. Export it anew.")
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)

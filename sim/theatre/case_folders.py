@@ -110,10 +110,11 @@ def _write_simulation(
     generator = torch.Generator().manual_seed(seed)
     with new_folder(out) as folder:
         report("drawing the poses")
-        known = copied(read_preoperative(patient, side, seed, settings, folder / "device.stl"), folder)
-        mesh = read_mesh(known.device.model.path)
+        given = read_preoperative(patient, side, seed, settings, folder / "device.stl")
+        known = copied(given, folder)
+        mesh = read_mesh(given.device.model.path)
         procedure = draw_procedure(known, mesh, settings.acquisition, generator)
-        ct, labels = _case_scan(known) if imaged is None else imaged()
+        ct, labels = _case_scan(given) if imaged is None else imaged()  # complaints are to name the files given
         if imaged is not None:
             check_same_patient(read_label_map(known.labels_path), labels, known.femur)
         images = simulate_images(

@@ -87,6 +87,7 @@ def test_bad_tables(tmp_path: Path) -> None:
     for text, message in (
         ("bones: {hip_left: 1}", "`anatomy` and `bones`"),
         ("anatomy: hip\nbones: {hip_left: -1}", "above 0"),
+        ("anatomy: hip\nbones: [1]", r"mine\.yaml, bones: bones with their ids were expected, .* found \[1\]"),
     ):
         (tmp_path / "mine.yaml").write_text(text)
         with pytest.raises(InputError, match=message):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from femoreg_torch.commands import batch
 from femoreg_torch.commands.batch import Job, Row, run_jobs
 from femoreg_torch.commands.main import main
 
@@ -40,3 +41,13 @@ def test_bad_options_are_told_before_any_case(
     assert main(["batch", *map(str, cases), "--out", str(tmp_path / "runs"), *options]) == 2
     assert says in capfd.readouterr().err
     assert not (tmp_path / "runs").exists()
+
+
+def test_what_a_killed_run_left_of_a_case_that_is_kept_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    left = tmp_path / "runs" / ".case.abcd1234.part"
+    (left / "new").mkdir(parents=True)
+    monkeypatch.setattr(batch, "kept", lambda job: Row(job.case.name, "kept", True, "", 0.0, {}))
+    assert main(["batch", str(tmp_path / "case"), "--out", str(tmp_path / "runs")]) == 0
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["table.csv"]

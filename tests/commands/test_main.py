@@ -123,8 +123,8 @@ def test_help_of_a_command_teaches(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["paint"], "no command 'paint'; there are: measure, fail, read, train."),
         (["--paint"], "no command '--paint'"),
-        (["measure"], "the following arguments are required"),
-        (["measure", "a.png"], "out"),
+        (["measure"], "`femoreg measure IMAGES --out OUT` was expected; IMAGES is missing, --out is missing. See"),
+        (["measure", "a.png"], "IMAGES --out OUT` was expected; IMAGES is given, --out is missing."),
         (["measure", "a.png", "--out", "run", "--preset", "best"], "best"),
         (["measure", "a.png", "--out", "run", "--spacing-mm", "wide"], "wide"),
         (["measure", "a.png", "--out", "run", "--paint", "1"], "--paint"),

@@ -1,11 +1,16 @@
 """`femoreg train` on a disk that fails at the n-th step: one line, and the next start goes on or begins anew."""
 
+import errno
 import json
+import logging
+import os
 import shutil
+import threading
 from pathlib import Path
 
 import pytest
 from fuzz_faults import FAULT, fault
+from tensorboard.summary.writer.record_writer import RecordWriter
 
 from femoreg_torch.commands.main import main
 from femoreg_torch.detect import load_network
@@ -65,6 +70,59 @@ def failing_at(n: int, prepared: list[str], out: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize("n", [1, 3, 9])
 def test_a_step_that_fails(n: int, prepared: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert failing_at(n, prepared, tmp_path / "out", capsys)
+
+
+def test_what_a_killed_run_left_beside_views_that_are_whole_is_removed(prepared: list[str], tmp_path: Path) -> None:
+    (view,) = Path(prepared[-1]).glob("*_00.safetensors")
+    left = view.with_name(f".{view.name}.abcd1234.part")
+    (left / "new").mkdir(parents=True)
+    assert main([*prepared, "--out", str(tmp_path / "out")]) == 0
+    assert not left.exists()
+
+
+def test_nothing_of_what_lightning_tells_stands_on_stderr(prepared: list[str], tmp_path: Path) -> None:
+    told: list[str] = []
+    ear = logging.Handler(logging.INFO)
+    ear.emit = lambda record: told.append(record.getMessage())  # type: ignore[method-assign]
+    logging.getLogger("lightning.pytorch").addHandler(ear)
+    try:
+        assert main([*prepared, "--out", str(tmp_path / "out")]) == 0
+    finally:
+        logging.getLogger("lightning.pytorch").removeHandler(ear)
+    assert told == []
+
+
+@pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_disk_that_is_full_for_a_thread_of_logs_is_told_once(
+    prepared: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(RecordWriter, "write", full)
+    monkeypatch.setattr(threading, "excepthook", threading.excepthook)  # to be given back
+    assert main([*prepared, "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err == f"femoreg: {tmp_path / 'out'}: No space left on device.\n"
+
+
+def test_a_folder_whose_name_logs_cannot_hold(
+    prepared: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*prepared, "--out", str(tmp_path / "out\udcff")]) == 2
+    assert "is not UTF-8" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_checkpoints_do_not_come_from_another_disk(
+    prepared: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved: list[str] = []
+    monkeypatch.setattr(shutil, "move", lambda source, target, *_, **__: moved.append(f"{source} to {target}"))
+    left = tmp_path / "out" / "checkpoints" / ".best.ckpt.abcd1234.part"
+    left.mkdir(parents=True)
+    assert main([*prepared, "--out", str(tmp_path / "out")]) == 0
+    assert moved == []
+    assert sorted(path.name for path in left.parent.iterdir()) == ["best.ckpt", "last.ckpt"]
 
 
 def test_a_case_that_lacks_a_landmark(case: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,6 +89,15 @@ def test_a_device_of_an_unlikely_size_is_refused(factor: float) -> None:
     assert bounds_of([HANDLE], "device.stl").tolist() == HANDLE.bounds.tolist()
 
 
+def test_a_corner_that_lacks_a_coordinate(tmp_path: Path) -> None:
+    lines = HANDLE.export(file_type="obj").splitlines(keepends=True)
+    second = [number for number, line in enumerate(lines) if line.startswith("v ")][1]
+    lines[second] = " ".join(lines[second].split()[:3]) + "\n"
+    (tmp_path / "device.obj").write_text("".join(lines))
+    with pytest.raises(InputError, match=r"device\.obj: a corner lacks a coordinate"):
+        read_mesh(tmp_path / "device.obj")
+
+
 def test_step_says_what_to_export(tmp_path: Path) -> None:
     (tmp_path / "device.STEP").write_text("ISO-10303-21;")
     with pytest.raises(InputError, match=r"device\.STEP: is a STEP file\. Export it as STL, or as 3MF"):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, label_table
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import temporary_file
+from femoreg_torch.files import clear_leftovers, temporary_file
 from femoreg_torch.segment.sphere import refitted_sphere
 from femoreg_torch.volume import read_label_map
 from sim.patient.around_surfaces.surfaces import read_surfaces
@@ -83,6 +83,7 @@ def read_shape(path: Path, spine: BoneShape | None = None) -> BoneShape:
 def cached_shapes(paths: list[Path], cache: Path) -> list[BoneShape]:
     """The shapes of these files, from `cache` where it has them; vertebrae are lent by the first that has some."""
     cache.mkdir(parents=True, exist_ok=True)
+    clear_leftovers(cache)
     spines: list[BoneShape] = []
     shapes: list[BoneShape] = []
     for path in sorted(paths, key=lambda path: "pelvic_ref" not in path.name):

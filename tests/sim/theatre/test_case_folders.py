@@ -1,5 +1,7 @@
 """Folders of the simulator, from a procedural patient to a complete case."""
 
+import re
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -121,3 +123,12 @@ def test_a_finer_scan_of_somebody_else_is_refused(patient, tmp_path):
     with pytest.raises(InputError, match=r"7\.0 mm elsewhere"):
         write_simulation(patient, tmp_path / "case", 5, None, "paper", lambda _: None, finer)
     assert not (tmp_path / "case").exists()
+
+
+def test_a_label_map_that_cannot_be_read_is_named_where_it_was_given(patient, tmp_path):
+    shutil.copytree(patient, tmp_path / "patient")
+    labels = tmp_path / "patient" / "labels.nii.gz"
+    labels.write_bytes(labels.read_bytes()[:99])
+    with pytest.raises(InputError, match=f"^{re.escape(str(labels))}: "):
+        simulate(tmp_path / "patient", out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
