@@ -12,6 +12,7 @@ from femoreg_torch.similarity.kinds import read_similarity
 from femoreg_torch.similarity.ncc import Ncc
 from femoreg_torch.similarity.orientation import GradientOrientation
 from femoreg_torch.similarity.quadratic import similarity_quadratic, similarity_quadratics
+from femoreg_torch.similarity.shift import shift_correlation
 
 __all__ = [
     "FieldSimilarity",
@@ -23,6 +24,7 @@ __all__ = [
     "SmoothFixedSimilarity",
     "against_field",
     "read_similarity",
+    "shift_correlation",
     "similarity_quadratic",
     "similarity_quadratics",
 ]
