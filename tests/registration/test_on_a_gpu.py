@@ -148,7 +148,7 @@ def test_a_plan_ends_where_it_ends_on_the_cpu(scene: Scene, gpu: PretendedGpu | 
         "test",
         (
             replace(stage(search, [pelvis], ["anatomy"]), images="first"),
-            OrbitSearch("orbit", ["anatomy"], ["pelvis", "femur"], 20, 2, LEVEL, SIMILARITY),
+            OrbitSearch("orbit", ["anatomy"], ["pelvis", "femur"], 20, 2, LEVEL, SIMILARITY, 20),
             stage(search, [device], ["device"]),
             Calibration("materials"),
             stage(joint, everything, ["all"]),
