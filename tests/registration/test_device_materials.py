@@ -92,13 +92,16 @@ def mixed() -> Scene:
 def test_material_and_pose_of_a_device_that_is_told_as_one_solid(mixed: Scene) -> None:
     """A dense rod and a light handle; the pose starts 2.4 mm and 1.5° off."""
     off = torch.tensor([[0.015, -0.015, 0.015, 1.0, -0.8, 2.0]], dtype=torch.float64)
-    fit = fit_device(mixed, poses(off), "device", "device")
-    assert fit is not None
-    deg, mm = pose_difference(poses().camera1_from["device"], fit.camera1_from, POINT)
-    assert mm < 0.3
-    assert deg < 0.75  # 0.37 to 0.65 over seven starts near this one; which of them it is changes with the machine
-    assert min(fit.attenuations) == pytest.approx(LIGHT, rel=0.25)
-    assert max(fit.attenuations) > 6 * LIGHT
+    turns = []  # 0.37 to 0.65° over starts so near to one another, and not the same on every machine
+    for share in (0.95, 1.0, 1.05):
+        fit = fit_device(mixed, poses(share * off), "device", "device")
+        assert fit is not None
+        deg, mm = pose_difference(poses().camera1_from["device"], fit.camera1_from, POINT)
+        turns.append(deg)
+        assert mm < 0.3
+        assert min(fit.attenuations) == pytest.approx(LIGHT, rel=0.25)
+        assert max(fit.attenuations) > 6 * LIGHT
+    assert sorted(turns)[1] < 0.6
     of_rod, of_handle = (fit.volume.data[part.data > 0].median() for part in (ROD, HANDLE))
     assert of_rod > 5 * of_handle
     assert fit.unsure
