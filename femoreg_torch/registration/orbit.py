@@ -23,7 +23,7 @@ from femoreg_torch.registration.step import (
     lacking,
     one_after_another,
 )
-from femoreg_torch.registration.weights import prepared
+from femoreg_torch.registration.weights import exposed_field, prepared
 from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import Similarity, shift_correlation
 
@@ -128,7 +128,7 @@ def _shifted(scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: 
         shift_correlation(
             _drawn(scene, poses, search, image, orbit),
             search.level.image(scene.image(*image), scene.carm.camera),
-            _field(scene, search.level, image),
+            exposed_field(scene, image, search.level),
             (rows, columns),
         )
         for image in images
@@ -140,8 +140,3 @@ def _shifted(scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: 
     moved = torch.eye(4, dtype=torch.float64).repeat(len(best), 1, 1)
     moved[:, :2, 3] = off.flip(1)
     return moved @ orbit[best]
-
-
-def _field(scene: Scene, level: Level, image: tuple[Kind, int]) -> Tensor | None:
-    exposed = scene.field(*image)
-    return None if exposed is None else level.field(exposed, scene.carm.camera)

@@ -71,13 +71,17 @@ def prepared(
     Raises `InputError` where nothing is left to compare.
     """
     kind, view = image
-    camera = scene.carm.camera
-    exposed = scene.field(kind, view)
-    field = None if exposed is None else level.field(exposed, camera)
+    fixed = level.image(scene.image(kind, view), scene.carm.camera)
     try:
-        return against_field(similarity, level.image(scene.image(kind, view), camera), weights, field)
+        return against_field(similarity, fixed, weights, exposed_field(scene, image, level))
     except InputError as error:
         raise InputError(f"view {view + 1}, {kind} image: {error}") from error
+
+
+def exposed_field(scene: Scene, image: tuple[Kind, int], level: Level) -> Tensor | None:
+    """The pixels (H, W), bool, of a level that the shutters of an image (kind, view) leave whole; None without shutters."""
+    exposed = scene.field(*image)
+    return None if exposed is None else level.field(exposed, scene.carm.camera)
 
 
 def _bones(scene: Scene, poses: Poses, names: Sequence[str], view: int, camera: Camera, step_mm: float) -> Tensor:
