@@ -79,7 +79,7 @@ def prepared(
 
 
 def exposed_field(scene: Scene, image: tuple[Kind, int], level: Level) -> Tensor | None:
-    """The pixels (H, W), bool, of a level that the shutters of an image (kind, view) leave whole; None without shutters."""
+    """The pixels (H, W), bool, of a level that the shutters of an image (kind, view) leave whole; None without any."""
     exposed = scene.field(*image)
     return None if exposed is None else level.field(exposed, scene.carm.camera)
 
