@@ -11,7 +11,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 from jsonargparse import ArgumentError, ArgumentParser, set_dumper, set_loader
 
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.text import yaml_content
+from femoreg_torch.text import check_no_aliases, yaml_content
 
 _T = TypeVar("_T")
 SEEDS = (0, 2**31 - 1)  # that every generator of random numbers takes
@@ -27,7 +27,9 @@ def plain_parser(**settings: Any) -> ArgumentParser:
 
 
 def _argument(text: str) -> Any:
-    return yaml_content(text, "value")
+    content = yaml_content(text, "value")
+    _check_texts(content, "value")
+    return content
 
 
 _CLASS = re.compile(r"<class '(?:\w+\.)*(\w+)'>")
@@ -69,6 +71,7 @@ def read_record(kind: type[_T], content: dict[str, Any], where: str, ready: Mapp
     the record itself refuses.
     """
     _check_form(kind, content, where)
+    _check_texts(content, where)
     ready = ready or {}
     parser = _parser(kind, frozenset(ready))  # type: ignore[arg-type]  # a class can be hashed
     try:
@@ -102,6 +105,18 @@ def _check_form(hint: Any, value: Any, where: str) -> None:
         elif get_origin(kind) is dict and isinstance(value, dict) and items:
             for key, item in value.items():
                 _check_form(items[1], item, f"{where}, {shortened(key)}")
+
+
+def _check_texts(value: Any, where: str) -> None:
+    """`check_no_aliases` for all texts in lists and mappings within one another."""
+    if isinstance(value, str):
+        check_no_aliases(value, where)
+    elif isinstance(value, list | tuple):
+        for number, item in enumerate(value):
+            _check_texts(item, f"{where}[{number}]")
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            _check_texts(item, f"{where}, {shortened(key)}")
 
 
 def _check_keys(record: Any, value: Any, where: str) -> None:

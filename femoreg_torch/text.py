@@ -9,6 +9,7 @@ import json
 import math
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -79,6 +80,20 @@ def yaml_content(text: str | bytes, where: str) -> Any:
     except (yaml.YAMLError, UnicodeError) as error:  # PyYAML encodes what it is given: lone surrogates are an error too
         raise InputError(f"{where}: cannot be read as YAML ({_reason(error)[:200]}).") from error
     return builder.content
+
+
+def check_no_aliases(text: str, where: str) -> None:
+    """Raises `InputError` for a text that is YAML of lists or mappings with aliases.
+
+    jsonargparse reads a text in the place of a number as YAML, by PyYAML itself, and quotes what it holds: half a
+    kilobyte of aliases of aliases would fill the memory.
+    """
+    if "&" not in text or "*" not in text:
+        return
+    with suppress(yaml.YAMLError):  # neither can jsonargparse read it then
+        seen = {type(event) for event in yaml.parse(text, Loader=_Loader)}
+        if yaml.AliasEvent in seen and seen & {yaml.SequenceStartEvent, yaml.MappingStartEvent}:
+            raise InputError(f"{where}: {shortened(text)} holds aliases (*), a plain value was expected.")
 
 
 def _reason(error: Exception) -> str:

@@ -90,3 +90,15 @@ def test_no_module_is_imported_that_a_file_names(
     with pytest.raises(InputError, match=r"a mapping|unknown key"):
         read_record(Outer, content, "a.yaml")
     assert "evil_module" not in sys.modules
+
+
+_ALIASES = "[" + ", ".join(f"&a{n} [{', '.join([f'*a{n - 1}' if n else 'x'] * 9)}]" for n in range(5)) + "]"
+
+
+def test_aliases_within_a_text_are_not_followed() -> None:
+    """jsonargparse reads a text as YAML where a number was expected, and quotes all that it stands for."""
+    contents = ({"inner": {"share": _ALIASES}}, {"inner": {}, "free": {"a": ["b", _ALIASES]}})
+    for content, place in zip(contents, (r"'inner', 'share'", r"'free', 'a'\[1\]"), strict=True):
+        with pytest.raises(InputError, match=rf"preset, {place}: .* holds aliases \(\*\)"):
+            read_record(Outer, content, "preset")
+    assert read_record(Outer, {"inner": {}, "free": {"a": "b & *c"}}, "preset").free == {"a": "b & *c"}  # no list

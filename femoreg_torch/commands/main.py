@@ -223,7 +223,11 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
     from jsonargparse import ArgumentError
 
     from femoreg_torch.settings import told
+    from femoreg_torch.text import check_no_aliases
 
+    for word in arguments:
+        option, _, value = word.partition("=") if word.startswith("--") else ("", "", word)
+        check_no_aliases(value, f"{name}: {option}" if option else name)
     if any(word == "" or re.fullmatch(r"--[\w-]+=", word) for word in arguments):
         raise InputError(f"{name}: an argument is empty. Is a variable of the shell not set?")
     options = [word.partition("=")[0] for word in arguments if word.startswith("--") and word != "--"]

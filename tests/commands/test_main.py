@@ -104,6 +104,12 @@ def test_the_command_line_overrides_the_file(tmp_path: Path, capsys: pytest.Capt
     assert capsys.readouterr().out == f"{[Path('a.png')]} run cios_fusion fast 4.0 False\n"
 
 
+def test_aliases_in_a_text_of_the_file_are_not_followed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "options.yaml").write_text("out: run\nspacing_mm: '[&a [x], *a]'\n")
+    assert main(["measure", "a.png", "--config", str(tmp_path / "options.yaml")]) == 2
+    assert "spacing_mm: '[&a [x], *a]' holds aliases" in capsys.readouterr().err.replace("'spacing_mm'", "spacing_mm")
+
+
 def test_a_command_may_have_a_config_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "small.yaml"]) == 0
     assert capsys.readouterr().out == "small.yaml\n"
@@ -131,6 +137,8 @@ def test_help_of_a_command_teaches(capsys: pytest.CaptureFixture[str]) -> None:
         (["measure", "a.png", "--out", "run", "--config", "no.yaml"], "no.yaml"),
         (["measure", "a.png", "--out", ""], "an argument is empty"),
         (["measure", "a.png", "--out="], "an argument is empty"),
+        (["measure", "a.png", "--out", "run", "--spacing-mm", "[&a [x], *a]"], "measure: '[&a [x], *a]' holds aliases"),
+        (["measure", "a.png", "--out", "run", "--spacing-mm=[&a [x], *a]"], "--spacing-mm: '[&a [x], *a]' holds"),
     ],
 )
 def test_wrong_arguments_are_one_line(argv: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
