@@ -40,7 +40,7 @@ class CmaEs:
             "tolfun": self.tol_f,
             "tolfunhist": self.tol_f / 10,
             "maxfevals": self.max_evaluations,
-            "seed": seed + 1,  # 0 would mean: from the clock
+            "seed": 1 + seed % (2**32 - 1),  # of 32 bits; 0 would mean: from the clock
             "verbose": -9,
         }
         strategy = cma.CMAEvolutionStrategy(np.zeros(n), 1.0, options)

@@ -58,6 +58,13 @@ def test_same_seed_same_bits_other_seed_another_path() -> None:
     assert not torch.equal(first.delta, other.delta)
 
 
+def test_cma_es_takes_seeds_of_more_than_32_bits() -> None:
+    """A registration numbers its stages by its seed times 1000, and studies have seeds of 31 bits."""
+    settings = CmaEs(population=12, max_evaluations=300)
+    first, second = (settings.minimise(bowl, 6, (2**31 - 1) * 1000 + stage) for stage in (1, 2))
+    assert not torch.equal(first.delta, second.delta)
+
+
 @pytest.mark.parametrize("settings", [CmaEs(population=10, max_evaluations=50), Bobyqa(max_evaluations=20)])
 def test_the_budget_is_kept(settings: Optimiser) -> None:
     result = settings.minimise(ripples, 6, seed=0)
