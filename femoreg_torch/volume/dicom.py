@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import SimpleITK as sitk
@@ -23,6 +23,9 @@ _TAGS = (
     "RescaleSlope", "RescaleIntercept",
 )  # fmt: skip
 _VOLUMES = ("CT", "MR", "PT", "NM", "OT")  # modalities whose series may be volumes; others are images, reports, masks
+_DEFLATED = "1.2.840.10008.1.2.1.99"  # transfer syntax
+_KINDS_OF_PIXELS = (b"OB", b"OW", b"OF", b"OD", b"UN")  # value representations of their element
+_UNDEFINED = 0xFFFFFFFF  # length of compressed pixels
 _AIR_HU = -1024.0  # what lies outside the slices of a tilted gantry
 _NOT_DICOM = {".gz", ".nii", ".nrrd", ".mha", ".mhd", ".json", ".txt", ".png", ".jpg", ".tif", ".tiff", ".zip", ".stl"}
 _SAME_PLACE_MM = 0.01  # slices that are closer are one
@@ -35,6 +38,7 @@ class Slice:
 
     path: Path
     header: Any  # pydicom.Dataset with some of `_TAGS`
+    holds_pixels: bool  # as many bytes of them as it claims
 
     def numbers(self, name: str, count: int) -> NDArray[np.float64] | None:
         """The numbers of a tag, or None where it is missing or holds something else."""
@@ -118,20 +122,39 @@ def series_in(folder: Path) -> list[Series]:
 def _headers(folder: Path) -> Iterator[Slice]:
     for path in sorted(folder.rglob("*")):
         if path.name.upper() != "DICOMDIR" and is_dicom(path):
-            yield Slice(path, _header(path))
+            yield _slice(path)
 
 
-def _header(path: Path) -> Any:
-    """Some tags of a DICOM file, as a `pydicom.Dataset`. Raises `InputError`."""
+def _slice(path: Path) -> Slice:
+    """Some tags of a DICOM file. Raises `InputError`."""
     import pydicom  # a fifth of a second, and most CTs are of other kinds
     from pydicom.errors import InvalidDicomError
 
     try:
-        return pydicom.dcmread(path, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
+        with path.open("rb") as file:
+            header = pydicom.dcmread(file, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
+            return Slice(path, header, _holds_pixels(file, header, path.stat().st_size))
     except (InvalidDicomError, OSError, ValueError, AttributeError, KeyError) as error:
         raise InputError(
             f"{path}: its DICOM header cannot be read ({error}). Export the series anew, or take the file away."
         ) from error
+
+
+def _holds_pixels(file: BinaryIO, header: Any, size: int) -> bool:
+    """Whether the bytes that the element of the pixels claims are there; the file, of that size, was read up to it.
+
+    GDCM believes a claim, and takes gigabytes of memory and half a minute for a broken file of some hundred bytes.
+    Layout of an element: DICOM PS3.5, chapter 7.1.
+    """
+    if str(getattr(header.file_meta, "TransferSyntaxUID", "")) == _DEFLATED:
+        return True  # its elements lie compressed in the file
+    implicit, little = header.original_encoding
+    element = file.read(12)
+    if len(element) < 12 or not (implicit or element[4:6] in _KINDS_OF_PIXELS):
+        return False
+    start = file.tell() - (4 if implicit else 0)
+    length = int.from_bytes(element[4:8] if implicit else element[8:], "little" if little else "big")
+    return length == _UNDEFINED or 0 < length <= size - start
 
 
 def choose_series(path: Path, wanted: str | None = None) -> Series:
@@ -142,10 +165,10 @@ def choose_series(path: Path, wanted: str | None = None) -> Series:
     """
     folder = path if path.is_dir() else path.parent
     there = series_in(folder)
-    if not there or (path.is_file() and not _header(path).get("SeriesInstanceUID")):
+    if not there or (path.is_file() and not _slice(path).header.get("SeriesInstanceUID")):
         raise InputError(f"{path}: holds no DICOM series. Give the folder of the slices, or a NIfTI, NRRD or MHA file.")
     if path.is_file():
-        uid = str(_header(path).get("SeriesInstanceUID") or "")
+        uid = str(_slice(path).header.get("SeriesInstanceUID") or "")
         return next(one for one in there if one.uid == uid)
     if wanted is not None:
         exact = [one for one in there if wanted in (one.number, one.uid)]
@@ -174,6 +197,9 @@ def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:
     for pixels that cannot be decoded.
     """
     where = str(series.slices[0].path.parent)
+    for one in series.slices:
+        if not one.holds_pixels:
+            raise InputError(f"{one.path}: holds fewer pixels than it claims, or none. Export the series anew.")
     if len(series.slices) == 1:
         if series.slices[0].whole("NumberOfFrames", 1) < 2:
             raise InputError(f"{series.slices[0].path}: is a single slice. Give the folder of the whole series.")

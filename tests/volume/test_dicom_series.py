@@ -330,3 +330,18 @@ def test_a_ct_is_no_segmentation(tmp_path: Path) -> None:
     write_series(tmp_path / "ct")
     with pytest.raises(InputError, match=r"a DICOM segmentation \(SEG\) was expected, found CT"):
         read_label_map(tmp_path / "ct" / "IM0250")
+
+
+@pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian, ExplicitVRBigEndian])
+@pytest.mark.parametrize("claimed", [2**32 - 2, 2 * SIZE[1] * SIZE[2] + 2, 0])
+def test_slices_that_claim_more_pixels_than_they_hold(tmp_path: Path, syntax: str, claimed: int) -> None:
+    """GDCM would take the memory that is claimed, gigabytes, and half a minute."""
+    write_series(tmp_path / "ct", syntax=syntax)
+    damaged = sorted((tmp_path / "ct").iterdir())[2]
+    content = damaged.read_bytes()
+    order = ">" if syntax == ExplicitVRBigEndian else "<"
+    before, length, pixels = content.rpartition(np.array(2 * SIZE[1] * SIZE[2], f"{order}u4").tobytes())
+    assert len(pixels) == 2 * SIZE[1] * SIZE[2]
+    damaged.write_bytes(before + np.array(claimed, f"{order}u4").tobytes() + pixels)
+    with pytest.raises(InputError, match=f"{damaged.name}: holds fewer pixels than it claims"):
+        read_ct(tmp_path / "ct")
