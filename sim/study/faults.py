@@ -31,6 +31,8 @@ _SOMEBODY_ELSE = 990001  # seed of a patient that no study images
 _BREAK_MM, _BREAK_DEG = 32.0, 20.0  # where the neck breaks, from the centre of the head, and how far the head turns
 _SOFT_TISSUE_HU = 40.0
 _BEND_MM, _SLIGHT_BEND_MM = 12.0, 6.0  # at 100 mm from the base: the tip is then told some 5 mm, or 2 mm, wrongly
+_KINK_DEG = 5.0  # of the front half against the rear one
+_ASIDE_MM, _BELOW_MM = 8.0, 80.0  # how far the shaft lies aside, from so far below the centre of the head on
 _LABELS = "femoreg"  # the table of the ids in these cases
 
 
@@ -149,6 +151,46 @@ def bend_device(folder: Path, by_mm: float = _BEND_MM) -> None:
     mesh.export(path)
 
 
+def kink_device(folder: Path) -> None:
+    """Turn the front half of the device's surface about where it meets the rear half; the named points stay."""
+    path = folder / f"{DEVICE}.stl"
+    mesh = read_mesh(path)
+    (_, _, low), (_, _, high) = mesh.bounds
+    middle = np.array([0.0, 0.0, (low + high) / 2])
+    vertices = mesh.vertices.copy()
+    front = vertices[:, 2] > middle[2]
+    turn = exp_so3(torch.tensor([math.radians(_KINK_DEG), 0.0, 0.0], dtype=torch.float64)).numpy()
+    vertices[front] = (vertices[front] - middle) @ turn.T + middle
+    mesh.vertices = vertices
+    mesh.export(path)
+
+
+def shift_shaft(folder: Path) -> None:
+    """Move the shaft of the operated femur to the patient's left in CT and label map, as if it had broken.
+
+    The truth is that of head and trochanter, with the entry point.
+    """
+    ct = read_ct(folder / "ct.nii.gz")
+    labels = read_labels(folder / "labels.nii.gz", ct)
+    content = read_case_file(folder)
+    head = read_landmarks(folder / "landmarks.json")[femoral_head(content["side"])]
+    (bone,) = label_table(_LABELS)[operated_femur(content["side"])]
+    femur = labels.data.numpy() == bone
+    index = torch.from_numpy(np.argwhere(femur)[:, ::-1].copy()).double()
+    below = (transform_points(labels.lps_from_index, index)[:, 2] < head[2] - _BELOW_MM).numpy()
+    shaft = np.zeros_like(femur)
+    shaft[tuple(np.argwhere(femur)[below].T)] = True
+
+    voxels = (torch.linalg.inv(ct.lps_from_index[:3, :3]) @ torch.tensor([_ASIDE_MM, 0.0, 0.0]).double()).round().int()
+    move = tuple(voxels.flip(0).tolist())
+    hu = ct.data.numpy().astype(np.float32)
+    moved, moved_hu = np.roll(shaft, move, (0, 1, 2)), np.roll(hu, move, (0, 1, 2))
+    new_hu = np.where(moved, moved_hu, np.where(shaft, np.float32(_SOFT_TISSUE_HU), hu))
+    new_labels = np.where(moved, bone, np.where(shaft, 0, labels.data.numpy())).astype(np.uint8)
+    write_volume(folder / "ct.nii.gz", ct.with_data(torch.from_numpy(new_hu.round().astype(np.int16))))
+    write_volume(folder / "labels.nii.gz", labels.with_data(torch.from_numpy(new_labels)))
+
+
 FAULTS: dict[str, Callable[[Path], None]] = {
     "mirrored patient": mirror_patient,
     "mirrored view": mirror_second_view,
@@ -157,6 +199,8 @@ FAULTS: dict[str, Callable[[Path], None]] = {
     "another patient": take_another_patient,
     "fractured femur": break_femur,
     "bent device": bend_device,
+    "shaft aside": shift_shaft,
+    "kinked device": kink_device,
     "slightly bent device": partial(bend_device, by_mm=_SLIGHT_BEND_MM),
 }
 

@@ -1,0 +1,88 @@
+"""An object that was bent since its model was made is told from a straight one."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from registration_scenes import REFERENCE_POINTS, VOLUMES, make_scene, off, true_poses
+from torch import Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.drr import project
+from femoreg_torch.geometry import Poses, centred_camera
+from femoreg_torch.registration import Scene
+from femoreg_torch.registration.doubts import doubts_about_rigidity
+from femoreg_torch.registration.imaging import PLAIN
+from femoreg_torch.registration.rigidity import CUTS, bend
+from femoreg_torch.registration.scene import Kind
+from femoreg_torch.volume import Volume
+
+TRUTH = true_poses()
+KINK_DEG = (5.0, -4.0, 0.0)  # along the axes of camera 1
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(TRUTH)
+
+
+def halves(volume: Volume, axis: int) -> tuple[Volume, Volume]:
+    """A volume's lower and upper half along an axis of its array."""
+    low = torch.zeros_like(volume.data)
+    half = volume.data.shape[axis] // 2
+    low.narrow(axis, 0, half).copy_(volume.data.narrow(axis, 0, half))
+    return volume.with_data(low), volume.with_data(volume.data - low)
+
+
+def images_of_broken(
+    name: str, axis: int, poses: Poses, kinds: dict[str, tuple[str, ...]]
+) -> dict[Kind, tuple[Tensor | None, ...]]:
+    """Images, finer than they are registered and averaged, with the upper half of an object turned by the kink."""
+    turned = off(poses.camera1_from[name], REFERENCE_POINTS[name], KINK_DEG, (0, 0, 0))
+    fine = centred_camera(1020.0, (1.5, 1.5), (176, 176))
+
+    def image(view: int, names: tuple[str, ...]) -> Tensor:
+        parts: list[Volume] = []
+        places: list[Tensor] = []
+        for each in names:
+            camera = poses.camera_from_camera1[view]
+            if each == name:
+                parts += halves(VOLUMES[each], axis)
+                places += [camera @ poses.camera1_from[each], camera @ turned]
+            else:
+                parts.append(VOLUMES[each])
+                places.append(camera @ poses.camera1_from[each])
+        return F.avg_pool2d(project(parts, torch.stack(places)[None], fine, 0.5)[None], 2)[0, 0]
+
+    return {kind: tuple(image(view, names) for view in range(3)) for kind, names in kinds.items()}
+
+
+KINDS = {"anatomy": ("pelvis", "femur"), "device": ("pelvis", "femur", "device")}
+
+
+def test_what_is_rigid_is_not_doubted(scene: Scene) -> None:
+    for name in REFERENCE_POINTS:
+        for share in CUTS:
+            found = bend(scene, TRUTH, name, share, PLAIN)
+            assert found is not None
+            assert found.apart_mm < 0.4, (name, share)
+    assert doubts_about_rigidity(scene, TRUTH, PLAIN) == ()
+
+
+@pytest.mark.parametrize(("name", "axis"), [("device", 2), ("femur", 0)])
+def test_a_broken_object_is_doubted_by_as_much_as_it_is_bent(scene: Scene, name: str, axis: int) -> None:
+    broken = replace(scene, images=images_of_broken(name, axis, TRUTH, KINDS))
+    found = bend(broken, TRUTH, name, 0.5, PLAIN)
+    assert found is not None
+    assert found.angle_deg == pytest.approx(float(torch.tensor(KINK_DEG).norm()), abs=2)
+    assert found.sureness > 4
+    (doubt,) = doubts_about_rigidity(broken, TRUTH, PLAIN)
+    assert f"the images show the ends of the {name}" in doubt
+    assert "bent or broken" in doubt
+
+
+def test_an_end_that_no_two_views_show_is_not_asked(scene: Scene) -> None:
+    beside = TRUTH.with_object(
+        "device", off(TRUTH.camera1_from["device"], REFERENCE_POINTS["device"], (0, 0, 0), (150, 0, 0))
+    )
+    assert all(bend(scene, beside, "device", share, PLAIN) is None for share in CUTS)
