@@ -121,7 +121,7 @@ def _cut(scene: Scene, poses: Poses, name: str, share: float, images: Sequence[t
     volume, data = thing.volume, thing.volume.data
     filled = (data > _INSIDE * data.max()).nonzero().cpu()
     points = transform_points(volume.lps_from_index, filled[:: 1 + len(filled) // _MOST_POINTS].flip(1).double())
-    times = torch.stack([_seen(scene, poses, name, view, points) for _, view in images]).sum(0)
+    times = torch.stack([_seen(scene, poses, name, image, points) for image in images]).sum(0)
     points = points[times >= min(2, len(images))]
     least = max(_LEAST_POINTS, round(_LEAST_SHARE * len(points)))
     if len(points) < 2 * least:
@@ -144,11 +144,15 @@ def _cut(scene: Scene, poses: Poses, name: str, share: float, images: Sequence[t
     return _Ends((one, other), both, points[near].mean(0))
 
 
-def _seen(scene: Scene, poses: Poses, name: str, view: int, points: Tensor) -> Tensor:
-    """Which points (N, 3) of an object lie on the detector in a view."""
-    camera = scene.camera(poses, view)
-    pixels = project_points(camera, transform_points(poses.camera_from(name)[view], points))
-    return ((pixels > 0) & (pixels < pixels.new_tensor(camera.shape).flip(0) - 1)).all(-1)
+def _seen(scene: Scene, poses: Poses, name: str, image: tuple[Kind, int], points: Tensor) -> Tensor:
+    """Which points (N, 3) of an object lie on the exposed part of the detector in an image."""
+    camera, exposed = scene.camera(poses, image[1]), scene.field(*image)
+    pixels = project_points(camera, transform_points(poses.camera_from(name)[image[1]], points))
+    on_it = ((pixels > 0) & (pixels < pixels.new_tensor(camera.shape).flip(0) - 1)).all(-1)
+    if exposed is not None:
+        column, row = torch.where(on_it[:, None], pixels, 0).round().long().unbind(1)
+        on_it &= exposed.cpu()[row, column]
+    return on_it
 
 
 def _heights(volume: Volume, axis: Tensor) -> Tensor:

@@ -86,3 +86,10 @@ def test_an_end_that_no_two_views_show_is_not_asked(scene: Scene) -> None:
         "device", off(TRUTH.camera1_from["device"], REFERENCE_POINTS["device"], (0, 0, 0), (150, 0, 0))
     )
     assert all(bend(scene, beside, "device", share, PLAIN) is None for share in CUTS)
+
+
+def test_an_end_that_shutters_hide_is_not_asked(scene: Scene) -> None:
+    shut = torch.zeros(scene.carm.camera.shape, dtype=torch.bool)
+    behind = replace(scene, fields={"device": (shut, shut, None)})
+    assert bend(behind, TRUTH, "device", 0.5, PLAIN) is None
+    assert bend(behind, TRUTH, "femur", 0.5, PLAIN) is not None  # the images without the device are exposed
