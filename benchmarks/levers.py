@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import femoreg_torch  # noqa: F401  # isort: skip  # before torch, whose threads else spend the processor on waiting
 import numpy as np
 import torch
 from measure import machine, table, write_section
