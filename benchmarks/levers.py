@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import femoreg_torch  # noqa: F401  # isort: skip  # before torch, whose threads else spend the processor on waiting
 import numpy as np
 import torch
 from measure import machine, table, write_section
@@ -24,7 +25,7 @@ from femoreg_torch.case import read_case
 from femoreg_torch.drr import cpu, project, project_with_jacobian
 from femoreg_torch.drr.bricks import BrickedVolume, bricked
 from femoreg_torch.fluoro import binned
-from femoreg_torch.geometry import Poses, about_point, exp_se3, transform_points
+from femoreg_torch.geometry import Camera, Poses, about_point, exp_se3, transform_points
 from femoreg_torch.optimize import levenberg
 from femoreg_torch.registration import Scene, Stage, load_plan, prepare_scene
 from femoreg_torch.registration.imaging import tissue_integrals
@@ -37,7 +38,7 @@ from femoreg_torch.registration.weights import prepared
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.similarity.curvature import patch_curvature
 from femoreg_torch.similarity.kernels import image_gradients
-from femoreg_torch.volume import looked_up
+from femoreg_torch.volume import Volume, looked_up
 from femoreg_torch.volume.attenuation import _dilated
 
 _CANDIDATES = 8
@@ -112,8 +113,9 @@ def _of_the_projector(scene: Scene, poses: Poses) -> Iterator[Lever]:
 
     for fewer, step_mm in ((8, 2.0), (16, 4.0)):
         coarse, fitting = scene.carm.camera.downsampled(fewer), Level(1.0, step_mm).volume(volume)
+        taken = " against ".join(f"{_samples(v, pose, coarse, step_mm) / 1e3:.0f}" for v in (fitting, volume))
         yield Lever(
-            f"voxels of {max(fitting.spacing_mm):.0f} mm, as large as the steps allow",
+            f"voxels of {max(fitting.spacing_mm):.0f} mm, as large as the steps allow ({taken} thousand samples)",
             f"one image, {coarse.shape[0]}²",
             partial(project, volume, pose, coarse, step_mm),
             partial(project, fitting, pose, coarse, step_mm),
@@ -134,6 +136,12 @@ def _of_the_projector(scene: Scene, poses: Poses) -> Iterator[Lever]:
         differences,
         lambda: project_with_jacobian(volume, pose, camera, centre)[1][0].movedim(-1, 0).double(),
     )
+
+
+def _samples(volume: Volume, pose: Tensor, camera: Camera, step_mm: float) -> int:
+    """Samples of one image of a volume."""
+    affine = torch.linalg.inv(pose @ volume.lps_from_index)[:, :3].numpy()
+    return samples(bricked(volume), affine, camera, np.zeros(1), step_mm)
 
 
 def _of_the_objective(scene: Scene, poses: Poses) -> Iterator[Lever]:

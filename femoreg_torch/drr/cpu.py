@@ -10,6 +10,7 @@ import math
 
 import numba as nb
 import numpy as np
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from femoreg_torch.drr.bricks import BRICK, RIM, SPREAD, BrickedVolume
@@ -104,7 +105,59 @@ def _runs(leap, shape, offset, step, source, dx, dy, dz, starts, ends):  # type:
     return n
 
 
+@_jit
+def _edges(affines, shape, slope, edges):  # type: ignore[no-untyped-def]
+    """See `_packet_edges`; neighbouring rays part by `slope` mm per mm. Compiled, for small images take no longer."""
+    inverse = np.empty((3, 3))
+    for pose in range(len(affines)):
+        linear, source = affines[pose, :, :3], affines[pose, :, 3]
+        for i in range(3):
+            for j in range(3):
+                a, b, c, d = (j + 1) % 3, (j + 2) % 3, (i + 1) % 3, (i + 2) % 3
+                inverse[i, j] = linear[a, c] * linear[b, d] - linear[a, d] * linear[b, c]
+        determinant = linear[0, 0] * inverse[0, 0] + linear[0, 1] * inverse[1, 0] + linear[0, 2] * inverse[2, 0]
+
+        farthest = 0.0  # corner of the volume, mm² from the source
+        for corner in range(8):
+            x = (shape[2] if corner & 1 else -1.0) - source[0]
+            y = (shape[1] if corner & 2 else -1.0) - source[1]
+            z = (shape[0] if corner & 4 else -1.0) - source[2]
+            squared = 0.0
+            for i in range(3):
+                squared += ((inverse[i, 0] * x + inverse[i, 1] * y + inverse[i, 2] * z) / determinant) ** 2
+            farthest = max(farthest, squared)
+
+        # Gershgorin's bound of the largest singular value, which is that value on a grid with right angles.
+        most = 0.0  # (voxels per mm)²
+        for i in range(3):
+            bound = 0.0
+            for j in range(3):
+                bound += abs(linear[i, 0] * linear[j, 0] + linear[i, 1] * linear[j, 1] + linear[i, 2] * linear[j, 2])
+            most = max(most, bound)
+        per_ray = slope * math.sqrt(farthest * most)
+        edges[pose] = min(max(1 + int(SPREAD * math.sqrt(2.0) / per_ray), 1), _MOST_RAYS)
+
+
 # Sums along one run of one ray ---------------------------------------------------------------------------------------
+@intrinsic
+def _pair(typing, flat, place):  # type: ignore[no-untyped-def]
+    """`flat[place]` and `flat[place + 1]`, both float32, by one load of 64 bits, little-endian as numba's machines are.
+
+    LLVM gathers for eight samples at a time, and gathers take their time by how many numbers they fetch, not by how
+    wide these are. To be called from the loop itself: LLVM takes the load apart again in a function of its own.
+    """
+
+    def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        single, half, whole = (context.get_value_type(t) for t in (nb.float32, nb.uint32, nb.uint64))
+        first = builder.gep(context.make_array(flat)(context, builder, arguments[0]).data, [arguments[1]])
+        both = builder.load(builder.bitcast(first, whole.as_pointer()), align=4)
+        above = builder.lshr(both, context.get_constant(nb.uint64, 32))
+        values = [builder.bitcast(builder.trunc(one, half), single) for one in (both, above)]
+        return context.make_tuple(builder, signature.return_type, values)
+
+    return nb.types.UniTuple(nb.float32, 2)(flat, nb.uintp), emit
+
+
 @_jit
 def _lowest(source, direction, t0, t1):  # type: ignore[no-untyped-def]
     """Lowest voxel that a run touches along one axis, and the float32 offset of its first sample from it."""
@@ -134,13 +187,14 @@ def _integral(flat, height, width, first, end, offset, step, source, dx, dy, dz)
         x, y, z = x0 + s * ax, y0 + s * ay, z0 + s * az
         i, j, k = np.int32(x), np.int32(y), np.int32(z)
         u, v, w = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-        p = np.uintp(base + np.int64(k * slab + j * row + i))
-        q, r = p + np.uintp(width), p + np.uintp(height * width)
-        s4 = r + np.uintp(width)
-        a0 = flat[p] + v * (flat[q] - flat[p])
-        a1 = flat[p + np.uintp(1)] + v * (flat[q + np.uintp(1)] - flat[p + np.uintp(1)])
-        b0 = flat[r] + v * (flat[s4] - flat[r])
-        b1 = flat[r + np.uintp(1)] + v * (flat[s4 + np.uintp(1)] - flat[r + np.uintp(1)])
+        place = np.uintp(base + np.int64(k * slab + j * row + i))
+        across, behind = place + np.uintp(width), place + np.uintp(height * width)
+        c000, c001 = _pair(flat, place)
+        c010, c011 = _pair(flat, across)
+        c100, c101 = _pair(flat, behind)
+        c110, c111 = _pair(flat, behind + np.uintp(width))
+        a0, a1 = c000 + v * (c010 - c000), c001 + v * (c011 - c001)
+        b0, b1 = c100 + v * (c110 - c100), c101 + v * (c111 - c101)
         a0 += w * (b0 - a0)
         a1 += w * (b1 - a1)
         total += a0 + u * (a1 - a0)
@@ -160,13 +214,12 @@ def _moments(flat, height, width, first, end, offset, step, source, dx, dy, dz):
         x, y, z = x0 + s * ax, y0 + s * ay, z0 + s * az
         i, j, k = np.int32(x), np.int32(y), np.int32(z)
         u, v, w = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-        p = np.uintp(base + np.int64(k * slab + j * row + i))
-        q, r = p + np.uintp(width), p + np.uintp(height * width)
-        s4 = r + np.uintp(width)
-        c000, c001 = flat[p], flat[p + np.uintp(1)]
-        c010, c011 = flat[q], flat[q + np.uintp(1)]
-        c100, c101 = flat[r], flat[r + np.uintp(1)]
-        c110, c111 = flat[s4], flat[s4 + np.uintp(1)]
+        place = np.uintp(base + np.int64(k * slab + j * row + i))
+        across, behind = place + np.uintp(width), place + np.uintp(height * width)
+        c000, c001 = _pair(flat, place)
+        c010, c011 = _pair(flat, across)
+        c100, c101 = _pair(flat, behind)
+        c110, c111 = _pair(flat, behind + np.uintp(width))
         d00, d01, d10, d11 = c001 - c000, c011 - c010, c101 - c100, c111 - c110
         e0, e1 = d00 + v * (d01 - d00), d10 + v * (d11 - d10)
         a, b = c000 + u * d00, c010 + u * d01
@@ -328,13 +381,9 @@ def _packet_edges(volume: BrickedVolume, affines: Array, camera: Camera) -> NDAr
 
     Each pose has its own, so that it renders the same whatever else is in the batch.
     """
-    linear, source = affines[:, :, :3], affines[:, :, 3]
-    corners = np.stack(np.meshgrid(*[(-1.0, n) for n in volume.shape[::-1]], indexing="ij"), -1).reshape(-1, 3)
-    inverse = np.linalg.inv(linear)
-    farthest = np.linalg.norm(np.einsum("bij,bkj->bki", inverse, corners - source[:, None]), axis=-1).max(-1)
-    voxels_per_mm = np.linalg.norm(linear, ord=2, axis=(1, 2))
-    per_pixel = max(camera.pixel_mm) * farthest / camera.sdd_mm * voxels_per_mm
-    return np.clip(1 + (SPREAD * math.sqrt(2) / per_pixel).astype(np.int64), 1, _MOST_RAYS)
+    edges = np.empty(len(affines), np.int64)
+    _edges(np.ascontiguousarray(affines, np.float64), volume.shape, max(camera.pixel_mm) / camera.sdd_mm, edges)
+    return edges
 
 
 def projection(
