@@ -340,7 +340,7 @@ def test_slices_that_claim_more_pixels_than_they_hold(tmp_path: Path, syntax: st
     damaged = sorted((tmp_path / "ct").iterdir())[2]
     content = damaged.read_bytes()
     order = ">" if syntax == ExplicitVRBigEndian else "<"
-    before, length, pixels = content.rpartition(np.array(2 * SIZE[1] * SIZE[2], f"{order}u4").tobytes())
+    before, _, pixels = content.rpartition(np.array(2 * SIZE[1] * SIZE[2], f"{order}u4").tobytes())
     assert len(pixels) == 2 * SIZE[1] * SIZE[2]
     damaged.write_bytes(before + np.array(claimed, f"{order}u4").tobytes() + pixels)
     with pytest.raises(InputError, match=f"{damaged.name}: holds fewer pixels than it claims"):
