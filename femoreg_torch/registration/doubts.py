@@ -41,8 +41,8 @@ _MOST_WITHOUT_SHADOW = 0.08  # share of a model's volume
 # mirrored, better by 0.04.
 _BETTER_MIRRORED = 0.005
 # Of the ends of an object, were it cut, on average over the end that moves less: of a model, and of a bone, whose CT
-# and label map err. Seen of 47 right procedures, with shutters, dark images and parts of the table in view, too: at most
-# 0.8 and 1.05 mm. Of devices bent by 2 mm or 5°, eleven of twelve 1.0 to 2.8 mm; of four broken femora 1.1 to 11 mm.
+# and label map err. Seen of 47 right procedures, with shutters, dark images and parts of the table too: at most 0.8 and
+# 1.05 mm. Of devices bent by 2 mm or 5°, eleven of twelve 1.0 to 2.8 mm; of four broken femora 1.1 to 11 mm.
 _MOST_APART_MM, _MOST_APART_OF_BONE_MM, _SURE_OF_BEND = 1.0, 1.5, 4.0
 
 
