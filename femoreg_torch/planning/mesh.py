@@ -55,8 +55,8 @@ class Blocks:
         firsts, parts, halves, boxes = [], [], [], []
         for axis, (overlap, half) in enumerate(zip(self.overlap, self.half_overlap, strict=True)):
             there = voxels.any(tuple(other for other in range(3) if other != axis))
-            rows = _extent((overlap[:, there] > 0).any(1))
-            box = _extent((overlap[rows] > 0).any(0))
+            rows = _extent(overlap[:, there])
+            box = _extent(overlap[rows].T)
             firsts.append(rows.start)
             parts.append(overlap[rows, box])
             halves.append(half[2 * rows.start : 2 * rows.stop, box])
@@ -112,9 +112,9 @@ def _spread(overlap: tuple[Array, ...], spacing: Array, values: NDArray) -> Arra
     return np.asarray(np.einsum("ax,by,cz,abc->xyz", x, y, z, np.asarray(values, float), optimize=True))
 
 
-def _extent(there: NDArray[np.bool_]) -> slice:
-    """From the first to the last that is there (N,)."""
-    found = np.flatnonzero(there)
+def _extent(overlap: Array) -> slice:
+    """From the first to the last row of (N, M) with anything in it."""
+    found = np.flatnonzero(overlap.sum(1))
     return slice(int(found[0]), int(found[-1]) + 1)
 
 
