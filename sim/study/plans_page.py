@@ -147,7 +147,7 @@ def _costs(all_found: Sequence[Measured]) -> str:
         return ""
     header = ("`femoreg plan` as a command", "elements", "processor time, s", "wall time, s", "memory, GB")
     cores = all_found[0].cost.get("cores", "?")
-    told = f"The whole plan, one thread, on {cores} cores that other work shared (so wall time says little):"
+    told = f"The whole plan, one thread, on {cores} cores that other work shared (idle ones take less):"
     return f"{told}\n\n{pipe_table(header, rows)}"
 
 
