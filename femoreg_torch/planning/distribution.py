@@ -28,7 +28,10 @@ class Mechanism:
 
         The second is what replacing all of an eighth by cement adds, `gain` (E, 8) being its rise of strength. By the
         kinematic theorem of plastic collapse no cement helps beyond the least of such bounds: the load of a mechanism
-        is the work that strength does on its strains, which is linear in where cement is.
+        is the work that strength does on its strains, which is all but linear in where cement is. It is linear in
+        eighths that cement fills or leaves free. One that it fills in part is weaker by Hill's average, so the bound is
+        too high by that: measured on two femora at 3 mm, by 3 and 6 % for the mechanism of the bone alone, by less than
+        0.3 % for that of the femur with the cement.
         """
         per_work = self.load_n / float((self.strength * self.plastic).sum())
         return per_work * float((bone_strength * self.plastic).sum()), per_work * gain * self.plastic
@@ -58,7 +61,10 @@ def optimise(
     Worth by `limit_load`: plastic strain at the end of the curve times what cement is stronger than the bone there. In
     the limit state that is the work per strength, the derivative of the limit load (lower-bound theorem; measured on a
     synthetic femur it beats the compliance, the criterion of classic evolutionary optimisation, by a factor of two in
-    gain). By `compliance`: strain energy times what cement is relatively stiffer. Worth is smoothed over `filter_mm`.
+    gain). By `compliance`: strain energy times what cement is relatively stiffer. Both count what cement adds to an
+    eighth that it fills at last, not the derivative of Hill's average, which is large where a little cement leaves the
+    weakest voxels of an eighth less weak (by it the first study's femur bore 3913 N in place of 4282 N). Worth is
+    smoothed over `filter_mm`.
     Removing what was placed made it swing, so nothing is removed. Raises `InputError` if the volume does not fit.
     """
     check_volume(bone, volume_ml)

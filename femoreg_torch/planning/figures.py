@@ -5,7 +5,7 @@ from pathlib import Path as File
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, StrMethodFormatter
 
 from femoreg_torch.files import temporary_file
 from femoreg_torch.planning.convergence import MeshRow
@@ -100,22 +100,27 @@ def robustness_figure(outcomes: Sequence[Outcome], baseline_n: float, planned_n:
     return figure
 
 
-def mesh_figure(rows: Sequence[MeshRow]) -> Figure:
-    """Yield load without cement, and gain, over the size of the elements; time over their number."""
-    figure = Figure(figsize=(14, 4.5), layout="constrained")
+def mesh_figure(meshes: Mapping[str, Sequence[MeshRow]]) -> Figure:
+    """Of each femur: yield load without cement, and gain, over the size of the elements; time over their number."""
+    figure = Figure(figsize=(14, 5), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
-    size, load, gain = ([getattr(row, name) for row in rows] for name in ("size_mm", "baseline_n", "gain"))
-    left.plot(size, load, "o-", color="#3b6ea5")
-    left.set(xlabel="elements, mm", ylabel="yield load without cement, N", ylim=(0, 1.15 * max(load)), xticks=size)
-    middle.plot(size, [100 * value for value in gain], "o-", color="#c0602b")
-    middle.set(xlabel="elements, mm", ylabel="gain of the same cement, %", ylim=(0, 115 * max(gain)), xticks=size)
-    count, seconds = [row.elements for row in rows], [row.seconds for row in rows]
-    right.loglog(count, seconds, "o-", color="#444444")
+    for name, rows in meshes.items():
+        size = [row.size_mm for row in rows]
+        left.plot(size, [row.baseline_n for row in rows], "o-", label=name)
+        middle.plot(size, [100 * row.gain for row in rows], "o-")
+        right.loglog([row.elements for row in rows], [row.seconds for row in rows], "o-")
+    sizes = sorted({row.size_mm for rows in meshes.values() for row in rows})
+    left.set(xlabel="elements, mm", ylabel="yield load without cement, N", xticks=sizes)
+    middle.set(xlabel="elements, mm", ylabel="gain of the same cement, %", xticks=sizes)
     right.set(xlabel="elements", ylabel="processor time of one curve, s")
-    right.set_xticks(count, [f"{n}" for n in count])
-    right.set_yticks(seconds, [f"{t:.0f}" for t in seconds])
-    right.minorticks_off()
+    for axis in (left, middle):
+        axis.set_ylim(0, 1.08 * axis.get_ylim()[1])
+    for axis in (right.xaxis, right.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(StrMethodFormatter("{x:.0f}"))
+        axis.set_minor_locator(NullLocator())
     for axis in (left, middle, right):
         axis.grid(alpha=0.3)
-    figure.suptitle("The same femur and cement on finer meshes, modelled")
+    figure.legend(loc="outside lower center", ncols=len(meshes))
+    figure.suptitle("Each femur with the same cement on finer meshes, modelled")
     return figure

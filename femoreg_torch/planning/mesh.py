@@ -1,8 +1,8 @@
 """Hexahedra over a bone: which there are, their nodes, and what voxels of the CT each averages.
 
 Properties are mapped voxel by voxel at the CT's resolution and then averaged over the eighth of an element around each
-Gauss point, and elements at the surface that are filled only in part are kept. Density averaged first, and whole
-elements at the surface, turn the mesh size into a factor of two in what cement gains.
+Gauss point (`model.py` says how), and elements at the surface that are filled only in part are kept. Density averaged
+first, and whole elements at the surface, turn the mesh size into a factor of two in what cement gains.
 """
 
 from dataclasses import dataclass
@@ -50,6 +50,23 @@ class Blocks:
         apart = np.asarray(values).reshape(a, b, c, 2, 2, 2).transpose(0, 3, 1, 4, 2, 5).reshape(2 * a, 2 * b, 2 * c)
         return _spread(self.half_overlap, self.spacing, apart)
 
+    def around(self, voxels: NDArray[np.bool_]) -> tuple["Blocks", Ints, tuple[slice, ...]]:
+        """The box of blocks that meets some voxels (X, Y, Z), its first block (3,), and the box of voxels it meets."""
+        firsts, parts, halves, boxes = [], [], [], []
+        for axis, (overlap, half) in enumerate(zip(self.overlap, self.half_overlap, strict=True)):
+            there = voxels.any(tuple(other for other in range(3) if other != axis))
+            rows = _extent(overlap[:, there])
+            box = _extent(overlap[rows].T)
+            firsts.append(rows.start)
+            parts.append(overlap[rows, box])
+            halves.append(half[2 * rows.start : 2 * rows.stop, box])
+            boxes.append(box)
+        first = np.array(firsts)
+        affine = self.lps_from_mm.copy()
+        affine[:3, 3] = self.lps((first * self.size_mm)[None])[0]
+        a, b, c = (len(part) for part in parts)
+        return Blocks(self.size_mm, (a, b, c), tuple(parts), tuple(halves), self.spacing, affine), first, tuple(boxes)
+
     def centres(self, index: Ints) -> Array:
         """Middles (N, 3), LPS mm, of blocks (N, 3)."""
         return self.lps(np.asarray((index + 0.5) * self.size_mm, float))
@@ -93,6 +110,12 @@ def _mean(overlap: tuple[Array, ...], size_mm: float, values: NDArray) -> Array:
 def _spread(overlap: tuple[Array, ...], spacing: Array, values: NDArray) -> Array:
     x, y, z = (part / edge for part, edge in zip(overlap, spacing, strict=True))
     return np.asarray(np.einsum("ax,by,cz,abc->xyz", x, y, z, np.asarray(values, float), optimize=True))
+
+
+def _extent(overlap: Array) -> slice:
+    """From the first to the last row of (N, M) with anything in it."""
+    found = np.flatnonzero(overlap.sum(1))
+    return slice(int(found[0]), int(found[-1]) + 1)
 
 
 def _overlap(corner: float, count: int, size_mm: float, voxels: int, spacing: float) -> Array:

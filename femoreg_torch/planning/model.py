@@ -1,5 +1,6 @@
 """The finite-element model of a femur: its mesh, and stiffness and strength of each element, with cement or without."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,11 +40,16 @@ class Bone:
 class Model:
     """Elements of a femur.
 
-    `material` and `fill`, the share of bone, are means over the eighth of an element around each Gauss point (E, 8),
-    where outside the bone counts as nothing, or nearly. With one mean for a whole element, bone that fills half of it
-    is as wide as the element at half the stiffness, and bends a quarter too stiffly. Properties that vary within
-    elements, over a mesh that does not fit the bone, are those of finite cells (Ruess et al. 2012, Biomech Model
-    Mechanobiol 11:425).
+    `material` and `fill`, the share of bone, are those of the eighth of an element around each Gauss point (E, 8). With
+    one mean for a whole element, bone that fills half of it is as wide as the element at half the stiffness, and bends
+    a quarter too stiffly. Properties that vary within elements, over a mesh that does not fit the bone, are those of
+    finite cells (Ruess et al. 2012, Biomech Model Mechanobiol 11:425).
+
+    Stiffness and strengths are Hill's average over the bone of an eighth: the mean of Voigt's bound, the arithmetic
+    mean, and Reuss's, the harmonic one (R. Hill, Proc. Phys. Soc. A 65 (1952) 349, of stiffness; for strengths it is
+    taken over). Voigt's alone joins a thin cortex and the spongy bone beside it side by side in all directions, which
+    larger elements do to more of the bone: on real femora 3 mm then bear 7 to 8 % more than 1.5 mm. What is outside
+    the bone counts as nothing, or nearly: the average is scaled by the eighth's filling.
     """
 
     mesh: Mesh
@@ -104,21 +110,47 @@ def make_model(bone: Bone, planning: Planning, size_mm: float | None = None) -> 
     too_many(int(kept.sum()), settings.most_elements, size)
     mesh = mesh_of(size, kept, grid.lps_from_mm[:3, :3], grid.lps_from_mm[:3, 3])
     ash = mesh.of(grid.mean(np.where(kept_voxels, bone.ash, 0.0)))
-    parts = [mesh.of(grid.octants(np.where(kept_voxels, part, 0.0))) for part in _parts(bone.material)]
-    never_void = [np.maximum(part, _VOID_SHARE * part.mean(1, keepdims=True)) for part in parts]
-    return Model(mesh, grid, kept_voxels, mesh.of(grid.octants(kept_voxels)), ash, Material(*never_void))
+    material = Material(*(mesh.of(part) for part in _hill(grid, kept_voxels, _parts(bone.material))))
+    fill_at_points = mesh.of(grid.octants(kept_voxels))
+    return Model(mesh, grid, kept_voxels, fill_at_points, ash, _never_void(material))
 
 
 def with_cement(model: Model, bone: Bone, cement: NDArray, settings: CementSettings) -> Material:
-    """Properties (E, 8) of the elements with cement in place of bone, mixed at each voxel by its share (X, Y, Z)."""
-    share = np.where(bone.femur.mask, cement, 0.0)
+    """Properties (E, 8) of the elements with cement in place of bone, mixed at each voxel by its share (X, Y, Z).
+
+    Voxels are then averaged as those of bone are. Elements beyond the box of the cement keep their properties.
+    """
+    share = np.where(model.voxels, cement, 0.0)
+    if not share.any():
+        return model.material
+    grid, first, box = model.grid.around(share > 0)
+    cells = model.mesh.cells - first
+    near = ((cells >= 0) & (cells < grid.shape)).all(1)
     values = (settings.modulus_mpa, settings.strength_mpa, settings.strength_mpa)
-    changes = [share * (new - old) for new, old in zip(values, _parts(bone.material), strict=True)]
-    changed = [
-        old + model.mesh.of(model.grid.octants(change))
-        for old, change in zip(_parts(model.material), changes, strict=True)
-    ]
+    mixed = [old[box] + share[box] * (new - old[box]) for old, new in zip(_parts(bone.material), values, strict=True)]
+    there = tuple(cells[near].T)
+    averaged = _never_void(Material(*(part[there] for part in _hill(grid, model.voxels[box], mixed))))
+    changed = [part.copy() for part in _parts(model.material)]
+    for part, new in zip(changed, _parts(averaged), strict=True):
+        part[near] = new
     return Material(*changed)
+
+
+def _hill(grid: Blocks, voxels: NDArray[np.bool_], parts: Sequence[Array]) -> list[Array]:
+    """Hill's averages (BX, BY, BZ, 8) of properties (X, Y, Z) over the bone in each eighth, times its filling."""
+    fill = grid.octants(voxels)
+    averages = []
+    for part in parts:
+        voigt = grid.octants(np.where(voxels, part, 0.0))
+        softness = grid.octants(np.divide(1.0, part, where=voxels, out=np.zeros(part.shape)))
+        reuss = np.divide(fill**2, softness, where=softness > 0, out=np.zeros_like(fill))
+        averages.append((voigt + reuss) / 2)
+    return averages
+
+
+def _never_void(material: Material) -> Material:
+    """No eighth (E, 8) without bone is quite void."""
+    return Material(*(np.maximum(part, _VOID_SHARE * part.mean(1, keepdims=True)) for part in _parts(material)))
 
 
 def _parts(material: Material) -> tuple[Array, Array, Array]:

@@ -317,7 +317,10 @@ class Planner:
 def places(
     bone: Bone, model: Model, mechanisms: Sequence[Mechanism], settings: CementSettings, size_mm: float = _GRID_MM
 ) -> Worth:
-    """Marrow in places of some mm, with what cement there is worth against each mechanism."""
+    """Marrow in places of some mm, with what cement there is worth against each mechanism.
+
+    Linear in the cement, as `Mechanism.bound` is, so a little too much for places that are filled in part.
+    """
     grid = blocks(bone.femur, size_mm)
     room = grid.mean(bone.pores)
     index = np.argwhere(room > 0.05)

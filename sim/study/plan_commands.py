@@ -23,7 +23,7 @@ def plans(
 
     Args:
         first: only the first so many femora.
-        meshes: compare meshes on the first femur.
+        meshes: compare meshes, which takes as long as all the rest.
         out: folder of cases and plans, and of what was measured so far.
         data: folder with the real CTs in ct/; the environment's FEMOREG_DATA, if set.
         docs: folder of the page that is to be renewed, with all that was measured so far.
@@ -34,7 +34,7 @@ def plans(
         planning.compare_laws(subject, out)
         if number == 0:
             planning.draw_errors(subject, out, _PAPER_RUNS)
-        if meshes and number == 0:
+        if meshes:
             planning.compare_meshes(subject, out)
     if docs is not None:
         found = [known for subject in planning.SUBJECTS if (known := planning.measured(subject, out)) is not None]

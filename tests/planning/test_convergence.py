@@ -46,8 +46,11 @@ def test_the_first_row_is_the_model_itself(
     assert row.baseline_n == prepared.curve().yield_load_n
     assert row.gain == pytest.approx(prepared.curve(cement).yield_load_n / row.baseline_n - 1)
     assert row.gain > 0
-    figure = mesh_figure([row, MeshRow(6.0, 2 * row.elements, row.baseline_n, row.gain, 3 * row.seconds)])
+    finer = MeshRow(6.0, 2 * row.elements, row.baseline_n, row.gain, 3 * row.seconds)
+    figure = mesh_figure({"one": [row, finer], "other": [row]})
     assert [axis.get_xlabel() for axis in figure.axes] == ["elements, mm", "elements, mm", "elements"]
+    assert [len(axis.lines) for axis in figure.axes] == [2, 2, 2]
+    assert [text.get_text() for text in figure.legends[0].texts] == ["one", "other"]
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.planning.calibration import Calibration, calibrate
 from femoreg_torch.planning.element import CORNERS
 from femoreg_torch.planning.femur import Femur, cut_out
-from femoreg_torch.planning.laws import bone_material
+from femoreg_torch.planning.laws import Material, bone_material
 from femoreg_torch.planning.loading import make_loading
 from femoreg_torch.planning.mesh import blocks
 from femoreg_torch.planning.model import make_bone, make_model, with_cement
@@ -127,6 +127,56 @@ def test_cement_replaces_bone_voxel_by_voxel(femur: Femur, planning: Planning) -
     deep = model.fill == 1
     np.testing.assert_allclose(full.modulus[deep], planning.cement.modulus_mpa)
     np.testing.assert_allclose(full.tension[deep], planning.cement.strength_mpa)
+
+
+def test_an_eighth_of_two_kinds_of_bone_has_hills_average(femur: Femur, planning: Planning) -> None:
+    """Layers of 30 and of 10 MPa, half and half: 20 MPa by Voigt, 15 MPa by Reuss; less bone bears as much less."""
+    even = tuple(n // 4 * 4 for n in femur.mask.shape)
+    cut = dataclasses.replace(femur, hu=femur.hu[: even[0], : even[1], : even[2]], mask=np.ones(even, bool))
+    cut.mask[:, :, 1::4] = False  # half of the voxels of every second row of eighths
+    layers = np.where(np.arange(even[0]) % 2 == 0, 30.0, 10.0)[:, None, None] * cut.mask
+    bone = dataclasses.replace(make_bone(femur, UNCALIBRATED, planning), femur=cut, ash=layers)
+    bone = dataclasses.replace(bone, material=Material(layers, 2 * layers, 3 * layers))
+    uncut = dataclasses.replace(planning, mesh=dataclasses.replace(planning.mesh, shaft_mm=300.0))
+    model = make_model(bone, uncut, 8.0)
+    np.testing.assert_allclose(np.unique(model.fill.round(9)), [0.5, 1.0])
+    for part, factor in ((model.material.modulus, 1), (model.material.tension, 2), (model.material.compression, 3)):
+        np.testing.assert_allclose(part, factor * 17.5 * model.fill)
+
+
+def test_cement_is_averaged_as_bone_is(femur: Femur, planning: Planning) -> None:
+    """The same as a bone that has the mixed properties from the start, and untouched elements stay as they are."""
+    bone = make_bone(femur, UNCALIBRATED, planning)
+    model = make_model(bone, planning, 5.0)
+    points = femur.points(np.argwhere(femur.mask))
+    cement = np.zeros(femur.mask.shape)
+    near = np.clip((16 - np.linalg.norm(points - (femur.frame.head + 20 * femur.frame.neck), axis=1)) / 4, 0, 1)
+    cement[femur.mask] = near
+    values = (planning.cement.modulus_mpa, planning.cement.strength_mpa, planning.cement.strength_mpa)
+    parts = (bone.material.modulus, bone.material.tension, bone.material.compression)
+    mixed = Material(*(old + cement * (new - old) * femur.mask for old, new in zip(parts, values, strict=True)))
+    expected = make_model(dataclasses.replace(bone, material=mixed), planning, 5.0).material
+    found = with_cement(model, bone, cement, planning.cement)
+    untouched = (model.cement_share(cement) == 0).all(1)
+    assert 50 < (~untouched).sum() < 0.5 * len(untouched)
+    for name in ("modulus", "tension", "compression"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name))
+        np.testing.assert_allclose(getattr(found, name)[untouched], getattr(model.material, name)[untouched])
+
+
+def test_blocks_around_voxels_are_those_of_the_whole(femur: Femur) -> None:
+    grid = blocks(femur, 5.0)
+    there = np.zeros(femur.mask.shape, bool)
+    there[10:15, 12, 20:33] = True
+    part, first, box = grid.around(there)
+    values = np.random.default_rng(4).random(femur.mask.shape)
+    whole = grid.octants(values)
+    cut = tuple(slice(a, a + n) for a, n in zip(first, part.shape, strict=True))
+    np.testing.assert_allclose(part.octants(values[box]), whole[cut])
+    touched = grid.mean(there) > 0
+    assert touched[cut].sum() == touched.sum()
+    index = np.argwhere(touched)
+    np.testing.assert_allclose(part.centres(index - first), grid.centres(index))
 
 
 def changed(labels: Volume, change: str) -> Volume:

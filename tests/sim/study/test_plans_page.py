@@ -1,5 +1,6 @@
 """The section that tells what plans are worth."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -62,11 +63,16 @@ def test_meshes_are_held_against_the_finest(tmp_path: Path, load: float, gain: f
     (tmp_path / "planning.md").write_text(
         "# Plan\n\nHead.\n\n## What was measured\n\nOld.\n\n## Last\n\nKept.\n", encoding="utf-8"
     )
-    write_plans([found({}, rows)], "make plans", tmp_path)
+    steady = [MeshRow(3.0, 8300, 3030.0, 0.30, 6.0), MeshRow(1.5, 63000, 3000.0, 0.32, 80.0)]
+    other = replace(found({}, steady), subject=SUBJECTS[1])
+    write_plans([found({}, rows), other, replace(found({}, []), subject=SUBJECTS[2])], "make plans", tmp_path)
     page = (tmp_path / "planning.md").read_text(encoding="utf-8")
-    assert f"of the finest (2 mm): {kept}." in page
-    assert ("**3 mm is not**" in page) == (kept == "2 mm")
-    assert "Not run: 2.5 mm, 1.5 mm." in page
+    first, second = (line for line in page.splitlines() if line.startswith("- "))
+    assert f"(seed 315): within both of the finest (2 mm): {kept}." in first
+    assert ("**3 mm is not**" in first) == (kept == "2 mm")
+    assert "Not run: 2.5 mm, 1.5 mm." in first
+    assert "(STS_044), right: within both of the finest (1.5 mm): 3 mm, 1.5 mm. Not run: 2.5 mm, 2 mm." in second
+    assert "| real CT (STS_044), right | 3 mm | 8300 | 3030 | +1.0 % | +30.0 % | -2.0 | 6 |" in page
     assert "Old." not in page
     assert page.startswith("# Plan\n\nHead.")
     assert page.endswith("## Last\n\nKept.\n")
