@@ -26,7 +26,9 @@ from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import voxelise_mesh
 from femoreg_torch.volume.materials import material_hu
 
-LEVEL = Level(pixel_mm=3, step_mm=0.5)
+FINE = Level(pixel_mm=1.5, step_mm=0.5)
+COARSE = Level(pixel_mm=3, step_mm=0.5)
+FINE_CARM = replace(CARM, camera=centred_camera(1020.0, (1.5, 1.5), (176, 176)))
 SIMILARITY = GradNcc(patch_radius=4)
 TRUTH = true_poses()
 CENTRE = float64(10, 4, 40)
@@ -62,13 +64,13 @@ def scene_of(device: Model, images: tuple[Tensor, ...]) -> Scene:
             Start(camera1_from=torch.eye(4, dtype=torch.float64)),
         ),
     }
-    return Scene(CARM, objects, {"anatomy": images, "device": images})
+    return Scene(FINE_CARM, objects, {"anatomy": images, "device": images})
 
 
 def test_a_labelled_volume_registers_as_the_mesh(tmp_path: Path) -> None:
     mesh, labels = as_mesh(tmp_path / "device.stl"), as_labels(tmp_path / "device.nii.gz")
     fine = voxelise_mesh(trimesh.load_mesh(mesh.path), 0.25, 5000.0)
-    camera = centred_camera(1020.0, (1.5, 1.5), (176, 176))  # twice as fine as what is registered
+    camera = centred_camera(1020.0, (0.75, 0.75), (352, 352))  # twice as fine as what is registered
     true = TRUTH.camera1_from["device"].clone()
     true[:3, 3] = float64(10, 12, 560) - true[:3, :3] @ CENTRE  # its middle is well within all images
     placed = TRUTH.with_object("device", true)
@@ -84,7 +86,7 @@ def test_a_labelled_volume_registers_as_the_mesh(tmp_path: Path) -> None:
         ["device"],
         ["pelvis", "device"],
         [BodyPlan(["device"], [2, 2, 2], [3, 3, 3])],
-        LEVEL,
+        FINE,
         SIMILARITY,
         LevenbergMarquardt(max_iterations=20),
     )
@@ -94,11 +96,11 @@ def test_a_labelled_volume_registers_as_the_mesh(tmp_path: Path) -> None:
     )
     for found in (by_mesh, by_labels):
         mm, deg = error(found, true, CENTRE)
-        assert mm < 0.35
-        assert deg < 0.2
+        assert mm < 0.15
+        assert deg < 0.1
     x, y, depth = ((by_labels - by_mesh) @ torch.cat([CENTRE, float64(1)]))[:3].abs().tolist()
-    assert max(x, y) < 0.1
-    assert depth < 0.5  # views 25° apart on pixels of 3 mm: either is that far from the truth in depth by itself
+    assert max(x, y) < 0.03
+    assert depth < 0.1  # views 25° apart
 
 
 def write_two_boxes(folder: Path) -> Model:
@@ -166,7 +168,7 @@ def test_an_orbit_search_looks_at_the_kind_of_image_it_names() -> None:
     scene = make_scene(TRUTH)
     blank = tuple(torch.zeros_like(image) for image in scene.images["anatomy"])
     scene = replace(scene, images={**scene.images, "anatomy": blank})
-    plan = Plan("test", (OrbitSearch("orbit", ["device"], ["device"], 20, 5, LEVEL, SIMILARITY),))
+    plan = Plan("test", (OrbitSearch("orbit", ["device"], ["device"], 20, 5, COARSE, SIMILARITY),))
     found = run_plan(scene, plan, TRUTH.camera1_from["pelvis"], 0, lambda *_: None).poses.camera_from_camera1
     for view in (1, 2):
         assert error(found[view], TRUTH.camera_from_camera1[view], float64(0, 0, 632))[1] < 3.0
@@ -174,7 +176,7 @@ def test_an_orbit_search_looks_at_the_kind_of_image_it_names() -> None:
 
 def test_views_by_a_device_that_is_in_no_image_are_refused() -> None:
     scene = make_scene(TRUTH, with_device=False)
-    plan = Plan("mine", (OrbitSearch("orbit", ["device"], ["device"], 20, 5, LEVEL, SIMILARITY),))
+    plan = Plan("mine", (OrbitSearch("orbit", ["device"], ["device"], 20, 5, COARSE, SIMILARITY),))
     with pytest.raises(
         InputError, match=r"registration preset mine, step “orbit”: it finds the C-arm .* the kind “device”"
     ):
