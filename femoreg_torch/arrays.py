@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from femoreg_torch.errors import InputError
 
@@ -24,6 +25,16 @@ _SHARE_OF_MEMORY = 0.5
 
 for _name in ("nibabel.global", "pydicom", "trimesh", "PIL"):
     logging.getLogger(_name).setLevel(logging.CRITICAL)  # what they log before they raise
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """A file, open for reading bytes. Raises `InputError` with its name, which a failed read does not tell."""
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}).") from error
 
 
 def check_voxels(shape: Sequence[int], where: str, hint: str) -> None:

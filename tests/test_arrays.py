@@ -5,6 +5,7 @@ import resource
 import struct
 import time
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,7 @@ import SimpleITK as sitk
 from femoreg_torch.arrays import MOST_PIXELS, check_claim, check_voxels, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import read_image
-from femoreg_torch.volume import read_ct, read_label_map, read_mesh, read_volume
+from femoreg_torch.volume import read_ct, read_label_map, read_landmarks, read_mesh, read_volume
 
 VOXELS = np.random.default_rng(0).integers(-1000, 1500, (6, 7, 8)).astype(np.int16)
 
@@ -204,3 +205,10 @@ def test_quiet_threads_leave_stderr_as_it_was(capfd: pytest.CaptureFixture[str])
         list(pool.map(loud, range(40)))
     os.write(2, b"after")
     assert capfd.readouterr().err == "after"
+
+
+@pytest.mark.parametrize("read", [read_volume, read_label_map, read_mesh, read_image, read_landmarks])
+def test_what_a_disk_does_not_give_is_told_with_its_name(read: Callable[[Path], object]) -> None:
+    """The memory of a process is a regular file whose first bytes cannot be read."""
+    with pytest.raises(InputError, match=r"/proc/self/mem: "):
+        read(Path("/proc/self/mem"))

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from femoreg_torch.anatomy import label_table, label_table_names
+from femoreg_torch.arrays import opened
 from femoreg_torch.volume import Volume
 from femoreg_torch.volume.borders import touched_faces
 
@@ -83,7 +84,7 @@ def fitting_tables(ids: Sequence[int]) -> list[str]:
 def header_warnings(path: Path) -> list[str]:
     """In words, where a NIfTI or NRRD header leaves open where the patient's left is, or contradicts itself."""
     if path.name.lower().endswith((".nrrd", ".nhdr")):
-        with path.open("rb") as file:
+        with opened(path) as file:
             header = file.read(_NRRD_HEADER).partition(b"\n\n")[0]
         if re.search(rb"^space:", header, re.MULTILINE):
             return []

@@ -15,6 +15,7 @@ import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
 
+from femoreg_torch.arrays import opened
 from femoreg_torch.errors import InputError
 
 _TAGS = (
@@ -94,7 +95,7 @@ def is_dicom(path: Path) -> bool:
     """Whether a file is DICOM: by its preamble, or, without one, by a first element of the group 0002 or 0008."""
     if not path.is_file() or path.suffix.lower() in _NOT_DICOM:
         return False
-    with path.open("rb") as file:
+    with opened(path) as file:
         head = file.read(132)
     bare = len(head) == 132 and head[:2] in (b"\x02\x00", b"\x08\x00") and head[3:4] == b"\x00"
     return head[128:] == b"DICM" or bare

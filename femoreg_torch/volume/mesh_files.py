@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from femoreg_torch.arrays import quiet
+from femoreg_torch.arrays import opened, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.volume.mesh import check_closed
 
@@ -72,7 +72,7 @@ def bounds_of(meshes: "Sequence[trimesh.Trimesh]", where: str) -> np.ndarray:
 
 def is_in_ras(path: Path) -> bool:
     """Whether 3D Slicer wrote into the file that its coordinates are RAS; without a word they are LPS to Slicer."""
-    with path.open("rb") as file:
+    with opened(path) as file:
         return b"SPACE=RAS" in file.read(512)
 
 

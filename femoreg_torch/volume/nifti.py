@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from femoreg_torch.arrays import check_claim, quiet
+from femoreg_torch.arrays import check_claim, opened, quiet
 from femoreg_torch.errors import InputError
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def _whole(path: Path, data: "nibabel.arrayproxy.ArrayProxy") -> bool:
 
     False does not mean that the file is damaged: one of several gzip members tells the size of the last.
     """
-    with path.open("rb") as file:
+    with opened(path) as file:
         file.seek(-4, 2)
         return int.from_bytes(file.read(), "little") == _size(data) % 2**32
 

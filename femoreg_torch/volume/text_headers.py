@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from femoreg_torch.arrays import check_claim
+from femoreg_torch.arrays import check_claim, opened
 from femoreg_torch.errors import InputError, shortened
 
 META_SUFFIXES, NRRD_SUFFIXES = (".mha", ".mhd"), (".nrrd", ".nhdr")
@@ -65,7 +65,7 @@ def check_text_header(path: Path) -> None:
     name = path.name.lower()
     if not name.endswith((*META_SUFFIXES, *NRRD_SUFFIXES)):
         return
-    with path.open("rb") as file:
+    with opened(path) as file:
         beginning = file.read(_LONGEST_HEADER)
     values = _of_meta_image(beginning, path) if name.endswith(META_SUFFIXES) else _of_nrrd(beginning, path)
     if values is not None:
@@ -214,7 +214,7 @@ def _inflated(values: _Values) -> int:
     The checksum at the end is compared. Raises `zlib.error` for what is damaged.
     """
     stream, count = zlib.decompressobj(zlib.MAX_WBITS | 32), 0
-    with values.path.open("rb") as file:
+    with opened(values.path) as file:
         file.seek(values.start)
         while not stream.eof and count <= values.claimed:
             some = stream.unconsumed_tail or file.read(_CHUNK)
