@@ -9,7 +9,8 @@ from femoreg_torch.anatomy import HIP, Anatomy
 from femoreg_torch.detect.decode import decode_heatmaps, expected_error
 from femoreg_torch.detect.grid import image_from_network, network_camera, to_network_grid
 from femoreg_torch.detect.normalise import normalise
-from femoreg_torch.detect.tta import AUGMENTATIONS, PLAIN, Augmentation, predict
+from femoreg_torch.detect.polarity import bone_is_dark
+from femoreg_torch.detect.tta import AUGMENTATIONS, PLAIN, Augmentation, LogProbabilities, predict
 from femoreg_torch.detect.weights import LandmarkNetwork
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera
@@ -41,17 +42,23 @@ def detect(
 ) -> Detection:
     """Landmarks and bones in an `attenuation` image (H, W) of `camera`: bone bright, patient left on the right.
 
-    The image is read as it is, turned by 180°, and both again with its grey values inverted. The plain reading is kept
-    unless another one expects more landmarks by at least half a landmark. What is kept is then read again with
-    test-time augmentation. Raises `InputError` for an image that does not fit the camera, holds values that are not
-    finite, or is constant. The network computes where it is; what is found lies on the CPU.
+    The image is read as it is, turned by 180°, and both again with its grey values inverted, and that reading is kept
+    which expects most landmarks; the plain one unless it is exceeded by at least half a landmark. The network reads
+    either kind of grey values nearly as well, so the rims of the bones that it saw say whether bone is dark. What is
+    kept is then read again with test-time augmentation. Raises `InputError` for an image that does not fit the camera,
+    holds values that are not finite, or is constant. The network computes where it is; what is found lies on the CPU.
     """
     _check(attenuation, camera)
     image = normalise(to_network_grid(attenuation.to(torch.float32), camera)).to(network.device)
-    candidates = {(turned, inverted): _oriented(image, turned, inverted) for inverted in (0, 1) for turned in (0, 1)}
-    expected = {key: _expected_landmarks(network, candidate) for key, candidate in candidates.items()}
-    turned, inverted = max(expected, key=lambda key: expected[key] - _MARGIN * any(key))
-    prediction = predict(network, candidates[turned, inverted], augmentations).cpu()
+    readings = {
+        (turned, inverted): predict(network, _oriented(image, turned, inverted), PLAIN).cpu()
+        for inverted in (False, True)
+        for turned in (False, True)
+    }
+    turned, inverted = max(readings, key=lambda key: _expected_landmarks(readings[key]) - _MARGIN * any(key))
+    dark = bone_is_dark(readings[turned, inverted].segmentation.softmax(0), _oriented(image, turned, False).cpu())
+    inverted = inverted if dark is None else dark
+    prediction = predict(network, _oriented(image, turned, inverted), augmentations).cpu()
     positions, confidence = decode_heatmaps(prediction.heatmaps, prediction.absence)
     deviation = expected_error(prediction.heatmaps, positions, network.sigma_px)
     segmentation = prediction.segmentation.softmax(0)
@@ -70,21 +77,20 @@ def detect(
         (confidence >= VISIBLE) & inside,
         segmentation,
         grid.downsampled(factor),
-        bool(turned),
-        bool(inverted),
+        turned,
+        inverted,
         network.anatomy,
     )
 
 
-def _oriented(image: Tensor, turned: int, inverted: int) -> Tensor:
+def _oriented(image: Tensor, turned: bool, inverted: bool) -> Tensor:
     image = image.rot90(2) if turned else image
     return -image if inverted else image
 
 
-def _expected_landmarks(network: LandmarkNetwork, image: Tensor) -> float:
-    """The number of landmarks to expect in a normalised image on the network's grid, without augmentation."""
-    prediction = predict(network, image, PLAIN).cpu()
-    return decode_heatmaps(prediction.heatmaps, prediction.absence)[1].sum().item()
+def _expected_landmarks(reading: LogProbabilities) -> float:
+    """The number of landmarks to expect in an image that was read so."""
+    return decode_heatmaps(reading.heatmaps, reading.absence)[1].sum().item()
 
 
 def _check(image: Tensor, camera: Camera) -> None:

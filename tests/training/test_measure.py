@@ -43,9 +43,10 @@ class Planted(nn.Module):
 
 
 def images() -> Tensor:
-    """Two images, bright above, that rise to the left and to the right."""
+    """Two images, bright above, that rise to the left and to the right, with a bright bone at the upper edge."""
     row, column = torch.meshgrid(torch.arange(192.0), torch.arange(192.0), indexing="ij")
-    return torch.stack([-3 * row - column, -3 * row + column])
+    bone = 200 * ((row < 20) & (column >= 10) & (column < 30))
+    return torch.stack([-3 * row - column, -3 * row + column]) + bone
 
 
 def planting(pixels: Tensor, visible: Tensor, labels: Tensor) -> LandmarkNetwork:

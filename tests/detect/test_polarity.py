@@ -1,0 +1,48 @@
+"""Bones are told to be bright or dark by their rims, whatever soft tissue and the beam do."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from femoreg_torch.detect.polarity import bone_is_dark, rim_contrast
+
+_ROW, _COLUMN = torch.meshgrid(torch.arange(192.0), torch.arange(192.0), indexing="ij")
+DISC = (_ROW - 90).hypot(_COLUMN - 100) < 40  # a bone on the image's grid
+
+
+def segmentation(bone: Tensor) -> Tensor:
+    """Probabilities (2, 96, 96) of background and one bone."""
+    there = bone[::2, ::2].float() * 0.9 + 0.05
+    return torch.stack([1 - there, there])
+
+
+def picture(bone: float, noise: float = 0.1) -> Tensor:
+    """Soft tissue that is six times as dark on one side as a bone of 0.5 is bright, and a bone."""
+    grain = torch.randn(192, 192, generator=torch.Generator().manual_seed(0))
+    return 3 * _COLUMN / 192 + bone * DISC + noise * grain
+
+
+@pytest.mark.parametrize(("bone", "dark"), [(0.5, False), (-0.5, True)])
+def test_the_rims_of_a_bone_tell_it_from_soft_tissue(bone: float, dark: bool) -> None:
+    assert bone_is_dark(segmentation(DISC), picture(bone)) is dark
+
+
+def test_inverted_grey_values_change_the_sign() -> None:
+    image = picture(0.5)
+    assert_close(rim_contrast(segmentation(DISC), -image), -rim_contrast(segmentation(DISC), image))
+
+
+def test_two_flat_levels_differ_by_two_of_their_deviations() -> None:
+    """Half of the pixels one standard deviation above the mean, half below, but for the surroundings' own slope."""
+    flat = DISC.float()
+    assert rim_contrast(segmentation(DISC), flat) == pytest.approx(2.0, abs=0.3)
+
+
+def test_nothing_is_said_without_a_bone_or_without_contrast() -> None:
+    nothing = torch.zeros_like(DISC)
+    assert math.isnan(rim_contrast(segmentation(nothing), picture(0.5)))
+    assert bone_is_dark(segmentation(nothing), picture(0.5)) is None
+    assert bone_is_dark(segmentation(DISC), picture(0.0)) is None
