@@ -36,14 +36,16 @@ _NO_KEY = object()
 
 def read_bytes(path: Path, most: int) -> bytes:
     """The content of a regular file. Raises `InputError` if it is missing, cannot be read or holds more bytes."""
+    content = None
     try:
-        if not path.is_file():
-            raise InputError(f"{path}: no such file.")
-        with path.open("rb") as file:
-            content = file.read(most + 1)
+        if path.is_file():
+            with path.open("rb") as file:
+                content = file.read(most + 1)
     except (OSError, ValueError) as error:  # ValueError: a path with a null byte
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise InputError(f"{shortened(path)}: cannot be read ({reason}).") from error
+    if content is None:
+        raise InputError(f"{path}: no such file.")
     if len(content) > most:
         raise InputError(
             f"{path}: is larger than {most / 2**20:g} MB, which no file of this kind is. Is it another one?"

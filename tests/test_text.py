@@ -129,3 +129,9 @@ def test_no_value_is_printed_as_a_whole() -> None:
     assert shortened({"a": 1}) == "a dict of 1"
     assert len(shortened(["a" * 1000] * 4)) <= 60
     assert len(shortened(10**17)) < 60
+
+
+def test_a_missing_file_is_named_once(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as told:
+        read_yaml(tmp_path / "case.yaml")
+    assert str(told.value) == f"{tmp_path / 'case.yaml'}: no such file."
