@@ -39,3 +39,8 @@ def shortened(value: Any, most: int = 60) -> str:
     else:
         text = " ".join(str(value).split())
     return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def in_mm(length: float) -> str:
+    """A length for a message, in figures as people write them: `0.12 mm`, `60000 mm`."""
+    return f"{length:.0f} mm" if 100 <= length < 1e7 else f"{length:.3g} mm"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numba
 import pytest
+from hypothesis import settings
 
 # Several processes of tests share the machine's cores. Libraries read these when they are first imported.
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
@@ -15,6 +16,9 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
     for _library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
         os.environ.setdefault(f"{_library}_NUM_THREADS", str(_threads))
     numba.config.reload_config()  # pytest has imported it already, to know its warnings
+
+settings.register_profile("untimed", deadline=None)  # on a busy machine anything may take a second
+settings.load_profile("untimed")
 
 
 @pytest.fixture(scope="session")

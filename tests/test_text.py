@@ -7,7 +7,7 @@ import pytest
 import yaml
 from femoreg_torch.configs import load_preset
 
-from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.errors import InputError, in_mm, shortened
 from femoreg_torch.files import read_csv, read_json
 from femoreg_torch.text import json_content, read_yaml, yaml_content
 
@@ -135,3 +135,10 @@ def test_a_missing_file_is_named_once(tmp_path: Path) -> None:
     with pytest.raises(InputError) as told:
         read_yaml(tmp_path / "case.yaml")
     assert str(told.value) == f"{tmp_path / 'case.yaml'}: no such file."
+
+
+@pytest.mark.parametrize(
+    ("length", "told"), [(0.1234, "0.123 mm"), (99.96, "100 mm"), (60000.4, "60000 mm"), (3.2e30, "3.2e+30 mm")]
+)
+def test_lengths_are_told_as_people_write_them(length: float, told: str) -> None:
+    assert in_mm(length) == told

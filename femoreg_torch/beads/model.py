@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, in_mm
 
 MINIMUM = 4  # beads: three leave up to four poses (Fischler and Bolles, Commun ACM 24 (1981) 381)
 _SPREAD_MM = 1.0  # least extent of a set of beads, the diameter of one
@@ -45,7 +45,7 @@ def check_beads(points: Tensor, where: str) -> None:
             "in metres? Give mm."
         )
     if extent > _LARGEST_MM:
-        raise InputError(f"{where}: the beads spread over {extent:.3g} mm, more than any bone or device. Give mm.")
+        raise InputError(f"{where}: the beads spread over {in_mm(extent)}, more than any bone or device. Give mm.")
     axes = torch.linalg.svd(middle).Vh
     across = 2 * float((middle @ axes[1:].T).norm(dim=1).max())
     if across < _ACROSS_MM:

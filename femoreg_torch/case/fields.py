@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.errors import InputError, in_mm, shortened
 from femoreg_torch.geometry import check_rigid, read_itk_transform
 from femoreg_torch.geometry.rigid import FARTHEST_MM
 
@@ -102,7 +102,9 @@ class Fields:
         """The point (3,), float64, under `key`."""
         point = self._numbers(key, (3,), "a point [x, y, z] in mm")
         if point.abs().max() > FARTHEST_MM:
-            raise InputError(f"{self.where(key)}: {point.abs().max():.3g} mm is farther than any room. Is it in mm?")
+            raise InputError(
+                f"{self.where(key)}: {in_mm(float(point.abs().max()))} is farther than any room. Is it in mm?"
+            )
         return point
 
     def matrix(self, key: str, shape: tuple[int, int]) -> Tensor:

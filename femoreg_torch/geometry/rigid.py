@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, in_mm
 
 _SMALL = 1e-2  # rad; below it the series beat the closed forms even in float32
 
@@ -169,7 +169,7 @@ def check_rigid(transform: Tensor, where: str, tolerance: float = 1e-4) -> Tenso
         raise InputError(f"{where}: the matrix holds values that are not finite. Write it anew.")
     if transform[:3, 3].abs().max() > FARTHEST_MM:
         raise InputError(
-            f"{where}: moves by {transform[:3, 3].abs().max():.3g} mm, farther than any room. Is it in mm?"
+            f"{where}: moves by {in_mm(float(transform[:3, 3].abs().max()))}, farther than any room. Is it in mm?"
         )
     rotation = transform[:3, :3]
     bottom = transform.new_tensor([0.0, 0.0, 0.0, 1.0])

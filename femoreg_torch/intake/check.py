@@ -25,6 +25,7 @@ from femoreg_torch.case.model import PlannedPath, Side
 from femoreg_torch.case.models import MODEL_KEYS, read_model
 from femoreg_torch.case.parts import read_carm, read_display
 from femoreg_torch.case.reading import read_fields
+from femoreg_torch.errors import in_mm
 from femoreg_torch.fluoro import Display
 from femoreg_torch.intake.check_anatomy import (
     SeenAnatomy,
@@ -152,7 +153,7 @@ def _check_device(top: Fields, folder: Path, path: PlannedPath | None, side: Sid
         length = float((points["tip"] - points["base"]).norm())
         if not _GUIDE_MM[0] <= length <= _GUIDE_MM[1]:
             found.warnings.append(
-                f"device: its tip lies {length:.3g} mm from its base. Is the model in mm? (Inches are 25.4 of them.)"
+                f"device: its tip lies {in_mm(length)} from its base. Is the model in mm? (Inches are 25.4 of them.)"
             )
     known = path is not None and side is not None and set(points) == set(DEVICE_POINTS)
     # what a pose in words depends on may be at fault itself: with anything in its place the words are still looked at

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.errors import InputError, in_mm, shortened
 from femoreg_torch.geometry import check_rigid, read_itk_transform, rigid
 from femoreg_torch.text import MOST_YAML_BYTES, read_bytes
 
@@ -67,7 +67,7 @@ def read_robot(path: Path, tool: str) -> Robot:
         base_from_tool = base_from_flange @ poses[f"flange_from_{tool}"]
     if (distance := base_from_tool[:3, 3].norm().item()) < _LEAST_REACH_MM:
         raise InputError(
-            f"{path}: the {tool} would stand {distance:.3g} mm from the robot's base. Are the translations in metres? "
+            f"{path}: the {tool} would stand {in_mm(distance)} from the robot's base. Are the translations in metres? "
             "Write them in mm."
         )
     return Robot(base_from_tool, base_from_flange)

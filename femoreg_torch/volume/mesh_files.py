@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from femoreg_torch.arrays import opened, quiet
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, in_mm
 from femoreg_torch.volume.mesh import check_closed
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def bounds_of(meshes: "Sequence[trimesh.Trimesh]", where: str) -> np.ndarray:
     longest = float((bounds[1] - bounds[0]).max())
     if not _SHORTEST_MM <= longest <= _LONGEST_MM:
         raise InputError(
-            f"{where}: its longest edge is {longest:.3g} mm, but a device has {_SHORTEST_MM:g} to {_LONGEST_MM:g} mm. "
+            f"{where}: its longest edge is {in_mm(longest)}, but a device has {_SHORTEST_MM:g} to {_LONGEST_MM:g} mm. "
             "The file is to be in mm (a GLB in metres, a 3MF in the unit that it names)."
         )
     return bounds
@@ -131,7 +131,9 @@ def _bodies(scene: "trimesh.Scene", path: Path) -> "dict[str, trimesh.Trimesh]":
         mesh.apply_transform(place)
         mesh.apply_scale(mm)
         if (abs(mesh.vertices) > _FARTHEST_MM).any():
-            raise InputError(f"{path}: a corner lies {abs(mesh.vertices).max():.3g} mm from the origin. Is it in mm?")
+            raise InputError(
+                f"{path}: a corner lies {in_mm(float(abs(mesh.vertices).max()))} from the origin. Is it in mm?"
+            )
         mesh.merge_vertices()
         a, b, c = mesh.faces.T
         mesh.update_faces((a != b) & (b != c) & (c != a))  # slivers whose corners became one in the file's float32

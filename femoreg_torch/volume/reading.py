@@ -10,7 +10,7 @@ from torch import Tensor
 
 from femoreg_torch.anatomy.tables import LARGEST_ID
 from femoreg_torch.arrays import quiet
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, in_mm
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry.rigid import FARTHEST_MM
 from femoreg_torch.volume.dicom import choose_series, is_dicom, read_series
@@ -60,7 +60,7 @@ def _oriented(image: sitk.Image, path: Path) -> sitk.Image:
             f"{path}: voxels of {told} mm were found, {_FINEST_MM:g} to {_COARSEST_MM:g} mm expected. Is it in mm?"
         )
     if max(map(abs, image.GetOrigin())) > FARTHEST_MM:
-        raise InputError(f"{path}: its origin lies {max(map(abs, image.GetOrigin())):.3g} mm away. Export it anew.")
+        raise InputError(f"{path}: its origin lies {in_mm(max(map(abs, image.GetOrigin())))} away. Export it anew.")
     return sitk.DICOMOrient(image, "LPS")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, in_mm
 from femoreg_torch.volume import check_closed
 
 Points = NDArray[np.float64]
@@ -59,7 +59,7 @@ def read_surfaces(path: Path) -> BoneSurfaces:
         for axis, extent in enumerate(np.ptp(arrays[f"{bone}_vertices"], axis=0) if count else (0, 0, 0)):
             if not _SHORTEST_MM <= extent <= _LONGEST_MM:
                 raise InputError(
-                    f"{path}: `{bone}_vertices` span {extent:.3g} mm along {'xyz'[axis]}, but {_SHORTEST_MM:g} to "
+                    f"{path}: `{bone}_vertices` span {in_mm(extent)} along {'xyz'[axis]}, but {_SHORTEST_MM:g} to "
                     f"{_LONGEST_MM:g} mm were expected. Are they in mm?"
                 )
     bones = {
