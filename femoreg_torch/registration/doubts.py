@@ -72,7 +72,8 @@ def doubts_about_the_carm(scene: Scene, poses: Poses, covariance: PoseCovariance
     """What the images say against the C-arm's file, in words; nan counts as that.
 
     A shift of all principal points is nearly a turn of the C-arm: images ask for a quarter of it. So where intrinsics
-    were refined, a smaller shift is doubted as well.
+    were refined, a smaller shift is doubted as well. Where the images say little at the end, the estimate stays near
+    the file, however far a refinement went from it; so that way is asked too.
     """
     camera, uncertainty, mean = scene.carm.camera, scene.carm.assumed_uncertainty, covariance.intrinsics.mean
     advice = "check the C-arm's file, the pixel size and whether the images are cropped"
@@ -82,6 +83,15 @@ def doubts_about_the_carm(scene: Scene, poses: Poses, covariance: PoseCovariance
         doubts.append(
             f"the images fit a source distance of {fitted:.0f} mm, the C-arm's file says {camera.sdd_mm:.0f} mm "
             f"(± {uncertainty.sdd_percent:.1f} %): {advice}"
+        )
+    elif refined_sdd := [
+        change.sdd_factor
+        for change in poses.changes
+        if abs(math.log(change.sdd_factor)) > limits.most_intrinsics_sigma * uncertainty.sdd_percent / 100
+    ]:
+        doubts.append(
+            f"the images moved the source distance from the {camera.sdd_mm:.0f} mm of the C-arm's file "
+            f"(± {uncertainty.sdd_percent:.1f} %) to {refined_sdd[0] * camera.sdd_mm:.0f} mm: {advice}"
         )
     for view, shift in enumerate(mean[1:].view(-1, 2)):
         if not float(shift.abs().max()) <= limits.most_intrinsics_sigma:
