@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from femoreg_torch.case import Case, femoroplasty_form
 from femoreg_torch.case.femoroplasty import ANATOMY_IMAGES, DEVICE, DEVICE_IMAGES
@@ -25,6 +26,9 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display, check_header, check_matches, read_stored, settled_intensity
 from femoreg_torch.geometry import CArm
 from femoreg_torch.intake.found import Found
+
+_LOOK_PX = 96  # images are compared at about so many pixels across
+_MORE_ALIKE = 0.2  # correlation by which another view's image must be more alike before it is told
 
 
 def readable_views(top: Fields, folder: Path) -> list[View]:
@@ -71,6 +75,7 @@ def check_views(
             if path is not None and looked_at is not None:
                 _check_image(path, looked_at, carm, view.where(kind), read, found)
     _check_different(read, found)
+    _check_exchanged(_by_key(read), ANATOMY_IMAGES, found)
     if DEVICE in top and views and not any(DEVICE_IMAGES in view for view in views):
         found.warnings.append("no view has an image with the device, so it will not be found")
     return _by_key(read)
@@ -84,6 +89,8 @@ def check_images(case: Case, found: Found) -> dict[str, Tensor]:
         for kind, path in view.images.items():
             _check_image(path, shown, case.carm, f"{case.folder}/case.yaml, views[{number}].{kind}", read, found)
     _check_different(read, found)
+    if case.views:
+        _check_exchanged(_by_key(read), next(iter(case.views[0].images)), found)
     return _by_key(read)
 
 
@@ -109,3 +116,31 @@ def _check_different(images: Mapping[str, Tensor], found: Found) -> None:
     for (one, first), (other, second) in itertools.combinations(images.items(), 2):
         if torch.equal(first, second):
             found.problem(f"{other}: the same image as {one.rpartition(', ')[2]}. Give every exposure its own image.")
+
+
+def _check_exchanged(images: Mapping[str, Tensor], first_kind: str, found: Found) -> None:
+    """Warns of images that look less like the first one of their own view than like that of another view."""
+    looks = {key: _look(image) for key, image in images.items()}
+    firsts = {key.rpartition(".")[0]: look for key, look in looks.items() if key.endswith(f".{first_kind}")}
+    for key, look in looks.items():
+        view = key.rpartition(".")[0]
+        alike = {other: float((look * first).mean()) for other, first in firsts.items() if first.shape == look.shape}
+        if key == f"{view}.{first_kind}" or view not in alike:
+            continue
+        nearest = max(alike, key=lambda other: alike[other])
+        if alike[nearest] > alike[view] + _MORE_ALIKE:
+            found.warnings.append(
+                f"{key}: looks like {nearest}.{first_kind} (correlation {alike[nearest]:.2f}) and not like "
+                f"{view}.{first_kind} ({alike[view]:.2f}). Are images of two views exchanged? Both of a view are to be "
+                "of one C-arm pose."
+            )
+
+
+def _look(image: Tensor) -> Tensor:
+    """What is seen in an image (H, W), coarse, without slow changes of brightness: mean 0, mean square 1."""
+    factor = max(1, round(min(image.shape) / _LOOK_PX))
+    values = image.float() - image.min()
+    coarse = avg_pool2d(values[None, None], factor)
+    logs = (coarse + 0.01 * coarse.mean() + 1e-30).log()
+    detail = logs - avg_pool2d(logs, 11, stride=1, padding=5, count_include_pad=False)
+    return ((detail - detail.mean()) / detail.std().clamp_min(1e-30))[0, 0]

@@ -115,10 +115,8 @@ def _check_path(case: Case, ct: Volume) -> None:
 def _check_points(case: Case, thing: CaseObject, volume: Volume) -> None:
     """Raises `InputError` for a point (3,) of an object that lies nowhere near its model."""
     named = thing.points if thing.reference is None else {**thing.points, "reference": thing.reference}
-    half = torch.tensor(volume.data.shape[::-1]) * torch.tensor(volume.spacing_mm, dtype=torch.float64) / 2
-    across = volume.lps_from_index[:3, :3] / torch.tensor(volume.spacing_mm, dtype=torch.float64)
     for name, point in named.items():
-        beyond = ((across.T @ (point - volume.centre())).abs() - half).clamp_min(0).norm().item()
+        beyond = volume.beyond_mm(point)
         if beyond > _MOST_BEYOND_MM:
             raise InputError(
                 f"{case.folder}/case.yaml, {thing.name}: its point {name} lies {beyond:.0f} mm outside its model. Are "

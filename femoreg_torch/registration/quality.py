@@ -4,10 +4,11 @@ Signs of a wrong pose are measured at the solution. First, what the image gains 
 that is not where it is drawn explains little of the image. Second, where each view by itself would move the
 object in its own image plane: views that pull in different directions contradict each other, or their common geometry.
 Third, where all views together would move it, were everything free: what a stage held in a wrong place, the C-arm, say,
-moves then. Fourth, the standard deviations of the pose (`registration.covariance`), depth included. Fifth, how far it
-lies from where it was expected. Sixth, whether other starts of a stage ended elsewhere and fitted as well. Seventh,
-how far what is not known of the C-arm's source distance and principal points leaves it open beside the other objects;
-and of the C-arm itself, whether the images fit other intrinsics than its file says.
+moves then. Fourth, the standard deviations of the pose (`registration.covariance`), depth included. Neither asks a
+round model for its turn about its own axis (`registration.roundness`). Fifth, how far it lies from where it was
+expected. Sixth, whether other starts of a stage ended elsewhere and fitted as well. Seventh, how far what is not known
+of the C-arm's source distance and principal points leaves it open beside the other objects; and of the C-arm itself,
+whether the images fit other intrinsics than its file says.
 """
 
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ from femoreg_torch.registration.covariance import PoseCovariance, pose_covarianc
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs
+from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 
@@ -152,19 +154,43 @@ def _assess_object(
     in_question = carm_in_question(scene, poses, covariance, limits)
     rotation, translation = covariance.deviations(name) if in_question else covariance.by_images(name)
     pull = covariance.pull(name)
+    thing = scene.objects[name]
+    axis = round_axis(thing.volume) if thing.parts else None
+    judged = _Judged.of(covariance, poses, name, axis)
     displacement = _displacement(scene, poses, name)
     reason = (
         _reason(name, views, limits)
-        or _unsettled(name, pull, limits)
-        or _vague(name, *covariance.by_images(name), limits)
+        or _unsettled(name, judged.pull, limits)
+        or _vague(name, judged.rotation, judged.translation, limits)
         or _loose(name, scene.anchor, covariance, limits)
         or _displaced(scene, name, displacement, limits)
         or _rivalled(name, trace, limits)
     )
     told = reason or ("all views agree" if len(views) == scene.views else "all views that show it agree")
+    if reason is None and axis is not None:
+        told += "; it is round, and no image tells its turn about its own axis"
     return ObjectQuality(
         tuple(views), uncertainty, pull, tuple(rotation), tuple(translation), displacement, reason is None, told
     )
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """What is asked of an object's pose: all that moves it, but not the turn of a round one about its own axis."""
+
+    rotation: Sequence[float]  # (3,) degrees, standard deviations by the images
+    translation: Sequence[float]  # (3,) mm
+    pull: tuple[float, float]  # degrees and mm, of all images together
+
+    @classmethod
+    def of(cls, covariance: PoseCovariance, poses: Poses, name: str, axis: Axis | None) -> "_Judged":
+        if axis is None:
+            return cls(*covariance.by_images(name), covariance.pull(name))
+        i = 6 * covariance.bodies.index(name)
+        rest = axis.without_turn(poses.camera1_from[name], covariance.centres[i // 6])
+        step = rest @ covariance.step[i : i + 6]
+        sigma = (rest @ covariance.images[i : i + 6, i : i + 6] @ rest.T).diagonal().clamp_min(0).sqrt().tolist()
+        return cls(sigma[:3], sigma[3:], (float(step[:3].norm()), float(step[3:].norm())))
 
 
 def _displacement(scene: Scene, poses: Poses, name: str) -> tuple[float, float] | None:

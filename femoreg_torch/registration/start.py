@@ -133,7 +133,8 @@ def find_start(
     if detection.inverted:
         raise InputError(
             "bone seems to be darker than soft tissue where it should be brighter. Set `intensity` of the view (raw: "
-            "bone dark, log: bone bright), or invert the picture."
+            "bone dark, log: bone bright), or invert the picture. If it is right already, as it can be where few "
+            "landmarks are in view, give the landmarks by hand (--landmarks)."
         )
     names = anatomy.landmark_names
     usable = [i for i, name in enumerate(names) if name in landmarks and bool(detection.visible[i])]

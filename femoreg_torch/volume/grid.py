@@ -35,6 +35,13 @@ class Volume:
         last = torch.tensor(self.data.shape[::-1], dtype=torch.float64) - 1
         return self.lps_from_index[:3, :3] @ (last / 2) + self.lps_from_index[:3, 3]
 
+    def beyond_mm(self, point: Tensor) -> float:
+        """How far a point (3,), mm, lies outside the box of all voxels; 0 inside."""
+        spacing = torch.tensor(self.spacing_mm, dtype=torch.float64)
+        half = torch.tensor(self.data.shape[::-1]) * spacing / 2
+        along = (self.lps_from_index[:3, :3] / spacing).T @ (point - self.centre())
+        return (along.abs() - half).clamp_min(0).norm().item()
+
     def with_data(self, data: Tensor) -> "Volume":
         """Other values on the same grid."""
         if data.shape != self.data.shape:

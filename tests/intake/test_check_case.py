@@ -11,6 +11,7 @@ import nibabel
 import numpy as np
 import pytest
 import torch
+import trimesh
 from intake_files import HEAD, case_content, landmarks, markups, ras_affine, write_content, write_files
 
 from femoreg_torch.case import read_case
@@ -256,3 +257,36 @@ def test_warnings_of_a_ct(files: Path) -> None:
     assert any("metal" in one for one in ct_warnings(metal))
     cut = type(ct)(ct.data[:, :, 20:].contiguous(), ct.lps_from_index)
     assert any("bone is cut at the right face" in one for one in ct_warnings(cut))
+
+
+@pytest.mark.parametrize(
+    ("unit", "tip", "told"), [(1.0, -75.0, 0), (1.0, -95.0, 0), (1 / 25.4, -75.0, 2), (1.0, -120.0, 1)]
+)
+def test_a_point_beside_the_model_is_told(files: Path, tmp_path: Path, unit: float, tip: float, told: int) -> None:
+    """A drill may stand out of its sleeve; a model in inches, or with another origin, leaves its points beside it."""
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    trimesh.creation.cylinder(radius=4 * unit, height=150 * unit, sections=12).export(folder / "device.stl")
+    content = case_content()
+    content["device"]["points"] = {"tip": [0, 0, tip], "base": [0, 0, 50], "center": [0, 0, 0]}
+    write_content(folder, content)
+    warnings = [
+        each for each in check_case(folder, find_start=False).warnings if "outside the box of its model" in each
+    ]
+    assert len(warnings) == told, warnings
+
+
+@pytest.mark.parametrize(("order", "told"), [((1, 2, 3), 0), ((1, 3, 2), 2), ((2, 3, 1), 3)])
+def test_exchanged_images_are_told(files: Path, tmp_path: Path, order: tuple[int, ...], told: int) -> None:
+    """Each view shows lumps of its own; the images with the device show them darker, with a bar across."""
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    for view in (1, 2, 3):
+        lumps = cv2.GaussianBlur(np.random.default_rng(view).normal(size=(48, 40)), (0, 0), 2)
+        image = 30000 * np.exp(lumps / lumps.std() / 4)
+        cv2.imwrite(str(folder / f"view{view}.png"), image.astype(np.uint16))
+        image[20:26] *= 0.3
+        cv2.imwrite(str(folder / f"view{order[view - 1]}_device.png"), (0.7 * image).astype(np.uint16))
+    write_content(folder, case_content())
+    warnings = [each for each in check_case(folder, find_start=False).warnings if "exchanged?" in each]
+    assert len(warnings) == told, warnings

@@ -236,6 +236,16 @@ def test_a_principal_point_that_refinement_moved_far_is_told(scene: Scene, shift
     assert all("principal point of view 2 by 2.4 mm" in sentence for sentence in told)
 
 
+@pytest.mark.parametrize(("factor", "doubted"), [(1.05, False), (1.107, True), (0.93, True)])
+def test_a_source_distance_that_refinement_moved_far_is_told(scene: Scene, factor: float, doubted: bool) -> None:
+    """As with the CT of another patient: 11 % off, and images that say nothing of it at the end."""
+    poses = true_poses().with_changes((CameraChange(factor),) * 3)
+    covariance = final_covariance(scene, true_poses())
+    told = doubts_about_the_carm(scene, poses, covariance, Limits())
+    assert len(told) == doubted
+    assert all(f"to {factor * CARM.camera.sdd_mm:.0f} mm" in sentence for sentence in told)
+
+
 def test_a_wrong_file_that_was_not_refined_is_not_trusted(scene: Scene) -> None:
     wrong = _wrong(scene, 1.05)
     end = run_stage(wrong, _slid(scene, 1.05), replace(_stage(), bodies=_stage().bodies[:-1]), (0, 1, 2), 0)

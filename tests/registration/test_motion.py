@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from registration_scenes import make_scene, off, true_poses
 
@@ -73,3 +74,12 @@ def test_one_kind_of_images_tells_nothing_of_motion() -> None:
     covariance = pose_covariance(replace(scene, objects=objects), alone, _LEVEL, GradNcc(1))
     assert covariance.motions == ()
     assert doubts_about_motion(covariance) == ()
+
+
+@pytest.mark.parametrize(("views", "sigmas", "told"), [((0, 1, 2), 2.4, 1), ((0, 1, 2), 1.6, 0), ((1,), 2.4, 0)])
+def test_all_views_together_need_less_certainty(views: tuple[int, ...], sigmas: float, told: int) -> None:
+    """A leg that turned by 1.8°; one view by itself erred by up to 2.8 deviations where nothing had moved."""
+    motion = torch.tensor([0.0, 0.0, 1.8, 0.0, 0.0, 0.4], dtype=torch.float64)
+    found = MotionBetween("device", views, ("femur",), motion, motion.abs() / sigmas + 1e-9, 0.001)
+    covariance = replace(pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(found,))
+    assert len(doubts_about_motion(covariance)) == told

@@ -64,7 +64,7 @@ def test_a_view_from_a_side_asks_for_landmarks_by_hand() -> None:
 
 
 def test_inverted_grey_values_are_refused_however_many_landmarks_there_are() -> None:
-    with pytest.raises(InputError, match=r"view1.tif: bone seems to be darker"):
+    with pytest.raises(InputError, match=r"view1.tif: bone seems to be darker.*\(--landmarks\)"):
         start_by_detection(hip_case(), scene(), detection(14, inverted=True))
 
 

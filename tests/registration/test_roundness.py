@@ -1,0 +1,85 @@
+"""Round objects: found, and not asked for the turn that no image tells."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from femoreg_torch.geometry import Poses, exp_so3
+from femoreg_torch.registration.covariance import IntrinsicsEstimate, PoseCovariance
+from femoreg_torch.registration.quality import _Judged
+from femoreg_torch.registration.roundness import Axis, round_axis
+from femoreg_torch.volume import Volume, axis_aligned
+
+AXIS = torch.tensor([1.0, 2.0, 2.0], dtype=torch.float64) / 3
+MIDDLE = torch.tensor([19.0, 18.0, 21.0], dtype=torch.float64)
+EYE = torch.eye(4, dtype=torch.float64)
+
+
+def solid(shape: str) -> Volume:
+    """A solid of 24 mm along a tilted axis, in voxels of 0.5 mm."""
+    z, y, x = torch.meshgrid(*[0.5 * torch.arange(80, dtype=torch.float64)] * 3, indexing="ij")
+    away = torch.stack([x, y, z], -1) - MIDDLE
+    along = away @ AXIS
+    side = torch.linalg.cross(AXIS, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    side /= side.norm()
+    u, v = away @ side, away @ torch.linalg.cross(AXIS, side)
+    radius, within = u.hypot(v), along.abs() < 12
+    of = {
+        "rod": radius < 4,
+        "tube": (radius < 5) & (radius > 2.5),
+        "stepped": radius < torch.where(along > 4, 6.0, 3.0),
+        "square": (u.abs() < 3.5) & (v.abs() < 3.5),
+        "pin": (radius < 4) | ((v.hypot(along - 3) < 1.5) & (u > 0) & (u < 8)),
+        "bent": (u - 0.02 * along**2).hypot(v) < 3,
+    }[shape]
+    return Volume((0.05 * (of & within)).float(), axis_aligned((0.5, 0.5, 0.5), (0, 0, 0)))
+
+
+@pytest.mark.parametrize("shape", ["rod", "tube", "stepped"])
+def test_the_axis_of_a_round_object_is_found(shape: str) -> None:
+    axis = round_axis(solid(shape))
+    assert axis is not None
+    assert float((axis.direction @ AXIS).abs()) > math.cos(math.radians(0.5))
+    off = axis.point - MIDDLE
+    assert float((off - (off @ AXIS) * AXIS).norm()) < 0.1
+
+
+@pytest.mark.parametrize("shape", ["square", "pin", "bent"])
+def test_an_object_that_is_not_round_has_no_such_axis(shape: str) -> None:
+    assert round_axis(solid(shape)) is None
+
+
+def twist(about: Tensor, rotation_deg: Tensor, centre: Tensor, shift: Tensor) -> Tensor:
+    """The motion (6,), degrees and mm, about `centre` of a turn about the point `about`, and a shift."""
+    return torch.cat([rotation_deg, shift + torch.linalg.cross(rotation_deg * torch.pi / 180, centre - about)])
+
+
+def test_only_the_turn_about_the_axis_is_taken_away() -> None:
+    pose = EYE.clone()
+    pose[:3, :3] = exp_so3(torch.tensor([0.3, -0.8, 0.5], dtype=torch.float64))
+    pose[:3, 3] = torch.tensor([4.0, -7.0, 600.0])
+    along, on_it = pose[:3, :3] @ AXIS, pose[:3, :3] @ MIDDLE + pose[:3, 3]
+    centre, none = on_it + torch.tensor([9.0, 2.0, -5.0]), torch.zeros(3, dtype=torch.float64)
+    rest = Axis(MIDDLE, AXIS).without_turn(pose, centre)
+    assert (rest @ twist(on_it, 40 * along, centre, none)).abs().max() < 1e-9
+    shift = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    assert torch.allclose(rest @ twist(on_it, 40 * along, centre, shift), torch.cat([none, shift]))
+    tilt = torch.linalg.cross(along, shift)
+    assert torch.allclose((rest @ twist(on_it, tilt + 3 * along, centre, none))[:3], tilt)
+
+
+def test_a_turn_that_is_left_open_is_not_held_against_a_round_object() -> None:
+    open_turn = torch.cat([AXIS, torch.zeros(3, dtype=torch.float64)])
+    images = 0.01 * torch.eye(6, dtype=torch.float64) + 400 * open_turn[:, None] * open_turn
+    nothing = IntrinsicsEstimate(torch.zeros(1), torch.zeros(1))
+    covariance = PoseCovariance(("needle",), images, images, MIDDLE[None], nothing, 30 * open_turn)
+    poses = Poses(EYE[None], {"needle": EYE})
+    asked = _Judged.of(covariance, poses, "needle", None)
+    assert max(asked.rotation) > 10
+    assert asked.pull[0] == pytest.approx(30)
+    round_one = _Judged.of(covariance, poses, "needle", Axis(MIDDLE, AXIS))
+    assert max(round_one.rotation) < 0.11
+    assert max(round_one.translation) == pytest.approx(0.1)
+    assert round_one.pull == pytest.approx((0, 0), abs=1e-9)
