@@ -28,6 +28,7 @@ from femoreg_torch.fluoro import (
     without_penumbra,
 )
 from femoreg_torch.registration.models import model_attenuation
+from femoreg_torch.registration.roundness import round_axis
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.registration.silhouette import outline_of
 from femoreg_torch.volume import (
@@ -87,6 +88,7 @@ def prepare_scene(case: Case) -> Scene:
             thing.images or tuple(images),
             thing.start,
             parts=volumes.parts,
+            axis=round_axis(volumes.volume),
             materials_known=thing.model.materials_known,
         )
     known = case.views[-1].camera_from_camera1 is not None

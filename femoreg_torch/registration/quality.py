@@ -26,7 +26,7 @@ from femoreg_torch.registration.covariance import PoseCovariance, pose_covarianc
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs
-from femoreg_torch.registration.roundness import Axis, round_axis
+from femoreg_torch.registration.roundness import Axis
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 
@@ -154,8 +154,7 @@ def _assess_object(
     in_question = carm_in_question(scene, poses, covariance, limits)
     rotation, translation = covariance.deviations(name) if in_question else covariance.by_images(name)
     pull = covariance.pull(name)
-    thing = scene.objects[name]
-    axis = round_axis(thing.volume) if thing.parts else None
+    axis = scene.objects[name].axis
     judged = _Judged.of(covariance, poses, name, axis)
     displacement = _displacement(scene, poses, name)
     reason = (

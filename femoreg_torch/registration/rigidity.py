@@ -16,7 +16,7 @@ from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, image_quadratic, stage_objective
+from femoreg_torch.registration.objective import ImageCosts, image_costs, image_quadratic, stage_objective
 from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene, moved
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume
@@ -39,6 +39,7 @@ class Bend:
     deviation: Tensor  # (6,)
     apart_mm: float  # by which points of the end that moves less are moved on average, as far as images show them
     apart_deviation_mm: float
+    gain: float  # of similarity, by both ends together
 
     @property
     def angle_deg(self) -> float:
@@ -76,9 +77,15 @@ def bend(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging) 
     shown = [other for other in poses.camera1_from if other != name]
     for each in names:
         poses = poses.with_object(each, pose)
-    for level in _LEVELS:
+
+    def asked(level: Level) -> tuple[tuple[Body, ...], ImageCosts]:
         bodies = tuple(_body(poses, *end) for end in zip(names, ends.points, strict=True))
-        costs = image_costs(scene, poses, bodies, [*shown, *names], images, level, _SIMILARITY, imaging=imaging)
+        return bodies, image_costs(scene, poses, bodies, [*shown, *names], images, level, _SIMILARITY, imaging=imaging)
+
+    bodies, costs = asked(_LEVELS[-1])
+    uncut = float(costs(torch.zeros(1, len(costs.still), dtype=torch.float64)).mean())
+    for level in _LEVELS:
+        bodies, costs = asked(level)
         found = _OPTIMISER.minimise(stage_objective(costs, bodies, None), len(costs.still), seed=0).delta
         poses = moved(poses, bodies, found)
     model = image_quadratic(costs, found)
@@ -94,7 +101,7 @@ def bend(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging) 
     apart, deviation = min(
         _displacement(motion, covariance, transform_points(second, of) - other) for of in ends.points
     )
-    return Bend(motion, covariance.diagonal().sqrt(), apart, deviation)
+    return Bend(motion, covariance.diagonal().sqrt(), apart, deviation, uncut - model.value)
 
 
 def _displacement(motion: Tensor, covariance: Tensor, arms: Tensor) -> tuple[float, float]:

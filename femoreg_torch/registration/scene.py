@@ -20,6 +20,7 @@ from femoreg_torch.geometry import (
     transform_points,
 )
 from femoreg_torch.registration.intrinsics import Intrinsics
+from femoreg_torch.registration.roundness import Axis
 from femoreg_torch.volume import Volume
 
 Kind = str  # of images: those without and those with the device, say
@@ -35,6 +36,7 @@ class RigidObject:
     start: Start = field(default_factory=Start)  # where the landmarks put it, if nothing else is said
     classes: tuple[int, ...] = ()  # of the segmentation that show it; none for what the network does not know
     parts: tuple[Volume, ...] = ()  # of a model, each of one material; on the grid of `volume`, which is their sum
+    axis: Axis | None = None  # of a model that is round, as it was told
     materials_known: bool = False  # whether materials were named; the HU of a single solid may be a guess
     hardening: float = 0.0  # of the beam in it, see `registration.imaging.hardened`
     # differences of attenuation, 1/mm, of what was estimated: each comes in with an amount of mean 0 and variance 1
