@@ -42,6 +42,7 @@ _HALF_HEADS_MM = 88.0  # half the distance of the heads of adults, where only on
 # The cost of a face of a cut, of bone as bright as this 1.15, in the darkest sheet e^−3 of it.
 _CUT_BRIGHT_HU, _CUT_LEAST, _CUT_DARK = 400.0, 0.15, 3.0
 _UNIT = 100  # capacity of a cost of 1
+_GAP_MM = 10.0  # between parts of a femur
 _NECK, _NECK_COSINE = (0.8, -0.6), 0.2  # outwards and up; around the head all but this way lies the socket
 
 
@@ -181,21 +182,15 @@ def _frame(heads: list[Head], grid: Volume) -> _Frame:
         sides = {side: heads[0]}
     up = np.array([0.0, 0.0, 1.0]) - left[2] * left
     up /= np.linalg.norm(up)
-    axes = np.stack([left, np.cross(up, left), up])
-    x, y, z = (np.arange(n, dtype=np.float64) for n in reversed(grid.data.shape))
-    coordinates: list[Values] = []
-    for axis in axes:
-        i, j, k = axis @ affine[:3, :3]
-        start = axis @ (affine[:3, 3] - middle)
-        coordinates.append(
-            (start + i * x[None, None, :] + j * y[None, :, None] + k * z[:, None, None]).astype(np.float32)
-        )
-    return _Frame(
-        coordinates[0],
-        coordinates[1],
-        coordinates[2],
-        {side: (axes @ (head.centre - middle), head.radius) for side, head in sides.items()},
-    )
+    axes: Points = np.stack([left, np.cross(up, left), up])
+    x, y, z = np.ogrid[tuple(slice(n) for n in reversed(grid.data.shape))]
+    steps = axes @ affine[:3, :3]
+    starts = axes @ (affine[:3, 3] - middle)
+    along = [
+        (start + i * x + j * y + k * z).astype(np.float32).T for start, (i, j, k) in zip(starts, steps, strict=True)
+    ]
+    places = {side: (axes @ (head.centre - middle), head.radius) for side, head in sides.items()}
+    return _Frame(along[0], along[1], along[2], places)
 
 
 def _side_of(head: Head, ct: Volume) -> str:
@@ -211,8 +206,7 @@ def _side_of(head: Head, ct: Volume) -> str:
 def _cost_of_a_cut(hu: Values, sheets: Values) -> Values:
     """What it costs (Z, Y, X) to part a bone at a voxel: least in dark sheets, most in bright bone."""
     bright = (hu / _CUT_BRIGHT_HU).clip(0, 1) + _CUT_LEAST
-    result: Values = bright * np.exp(-_CUT_DARK * np.maximum(0, -sheets))
-    return result
+    return (bright * np.exp(-_CUT_DARK * np.maximum(0, -sheets))).astype(np.float32)
 
 
 def _parted(part: Mask, one: Mask, other: Mask, cost: Values) -> Mask:
@@ -243,7 +237,8 @@ def _named(bone: Mask, cost: Values, frame: _Frame, anatomy: Anatomy) -> NDArray
         femur = _femur(pelvis, cost, frame, *head, 1 if side == "left" else -1)
         labels[femur] = number[f"femur_{side}"]
         pelvis &= ~femur
-    middle = (beside < 28) & (back > 10) & (up > -60) | (beside < 25) & (up > 40) & (back > 0)
+    middle = (beside < 14) & (back > 10) & (up > -60) | (beside < 28) & (up > 20) & (back > 10)
+    middle |= (beside < 38) & (up > 50) & (back > 10) & (back < 40) | (beside < 25) & (up > 40) & (back > 0)
     middle |= (beside < 40) & (up > 130)
     outer = (beside > 70) | (back < 5) & (up < 45)
     axial = _parted(pelvis, middle, outer, cost)
@@ -275,10 +270,8 @@ def _femur(bone: Mask, cost: Values, frame: _Frame, centre: Points, radius: floa
 
 
 def _main_part(mask: Mask, around: Mask) -> Mask:
-    """The connected part that holds most of a place."""
-    parts, count = ndimage.label(mask)
-    if count < 2:
-        return mask
+    """What holds most of a place, over gaps of 10 mm at most: dark marrow may part a femur; a forearm lies farther."""
+    parts, count = ndimage.label(ndimage.binary_dilation(mask, iterations=round(_GAP_MM / 2 / VOXEL_MM)))
     here = np.bincount(parts[around & mask], minlength=count + 1)
     here[0] = 0
-    return parts == here.argmax()
+    return mask & (parts == here.argmax())

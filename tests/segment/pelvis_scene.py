@@ -38,6 +38,7 @@ def pelvis_scene() -> tuple[Volume, NDArray[np.uint8]]:
         hu[depth < 0] = 1000
         hu[depth < -2.5] = 250
         labels[depth < 0] = 1 + HIP.bone_names.index(bone)
+    hu[:, :5] = -1000
     hu += np.random.default_rng(0).normal(0, 15, hu.shape)
     affine = axis_aligned((SPACING_MM,) * 3, (first[0], first[1], first[2]))
     return Volume(torch.from_numpy(hu.astype(np.float32)), affine), labels

@@ -89,7 +89,7 @@ def found(scene: tuple[Volume, NDArray[np.uint8]]) -> Segmentation:
     return segment_bones_without_network(scene[0])
 
 
-def test_heads_are_found_left_first_and_one_alone_as_well(scene: tuple[Volume, NDArray[np.uint8]]) -> None:
+def test_heads_are_found_left_first(scene: tuple[Volume, NDArray[np.uint8]]) -> None:
     both = femoral_heads(scene[0])
     for head, side in zip(both, ("left", "right"), strict=True):
         np.testing.assert_allclose(head.centre, HEADS[side], atol=3.0)
