@@ -5,8 +5,9 @@
 Around each label map (ids of the table `autoseg`) a CT of 1 mm is computed by `sim.patient`, whose bone, soft tissue
 and noise are not those of the training's random CTs; the maps have no spine, so these CTs have none. Femora that a map
 cuts go on downwards as they end. Folders of synthetic patients (ct.nii.gz, labels.nii.gz, landmarks.json) are read as
-they are. Ways: `network` its outlines alone, `refined` what `femoreg segment` gives, `true` the refinement of the true
-labels averaged to the network's voxels.
+they are. Ways: `network` its outlines alone, `refined` what `femoreg segment` gives, `graph_cut` what it gives with
+`--way graph_cut`, `cuts` the same with `--unrefined`, `true` the refinement of the true labels averaged to the
+network's voxels.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from torch.nn import functional as F
 
 from femoreg_torch.anatomy import HIP, label_table
 from femoreg_torch.errors import InputError
-from femoreg_torch.segment import load_bone_network, propose_landmarks, segment_bones
+from femoreg_torch.segment import load_bone_network, propose_landmarks, segment_bones, segment_bones_without_network
 from femoreg_torch.segment.network import BoneNetwork
 from femoreg_torch.segment.refine import contact, refined_labels
 from femoreg_torch.volume import (
@@ -51,13 +52,15 @@ def main() -> None:
     parser.add_argument("cases", type=Path, nargs="+", help="label maps, or folders of synthetic patients")
     parser.add_argument("--weights", type=Path, help="by default the shipped ones")
     parser.add_argument("--cache", type=Path, required=True, help="where CTs around label maps are kept")
-    parser.add_argument("--ways", nargs="+", default=["refined", "network", "true"])
+    parser.add_argument("--ways", nargs="+", default=["refined", "graph_cut", "network", "cuts", "true"])
     parser.add_argument("--title", default="Bones of whole CTs around held-out shapes")
     options = parser.parse_args()
     network = load_bone_network(options.weights)
     ways: dict[str, Callable[[Volume, Labels], Labels]] = {
         "refined": lambda ct, _: segment_bones(ct, network).labels.data.numpy(),
         "network": lambda ct, _: segment_bones(ct, network, refine=False).labels.data.numpy(),
+        "graph_cut": lambda ct, _: segment_bones_without_network(ct).labels.data.numpy(),
+        "cuts": lambda ct, _: segment_bones_without_network(ct, refine=False).labels.data.numpy(),
         "true": lambda ct, truth: _from_truth(ct, truth, network),
     }
     rows = []
@@ -70,7 +73,7 @@ def main() -> None:
             start = time.process_time()
             found = ways[way](ct, truth)
             seconds = time.process_time() - start
-            marks = _landmark_errors(ct, found, points) if way in ("refined", "true") else "–"
+            marks = _landmark_errors(ct, found, points) if way in ("refined", "graph_cut", "true") else "–"
             row = [_name(path), way, *_row(found, truth, np.array(ct.spacing_mm)[::-1]), marks, f"{seconds:.0f}"]
             print(*row, sep=" | ", flush=True)
             rows.append(row)

@@ -1,23 +1,32 @@
 """`femoreg segment` and `femoreg landmarks`: bones and landmarks from a CT alone."""
 
 from pathlib import Path
+from typing import Literal
 
 
 def segment(
-    ct: Path, *, out: Path, series: str | None = None, weights: Path | None = None, unrefined: bool = False
+    ct: Path,
+    *,
+    out: Path,
+    series: str | None = None,
+    way: Literal["network", "graph_cut"] = "network",
+    weights: Path | None = None,
+    unrefined: bool = False,
 ) -> None:
     """Label hip bones, sacrum, femora and vertebrae in a CT, left and right, without any download.
 
     Writes OUT, a label map on the grid of the CT with the ids of the table `femoreg` (left hip bone 1, right 2,
     vertebrae 3, sacrum 4, left femur 5, right 6), and beside it a picture of three planes (.png) and confidence,
-    volumes and warnings (.json). Look at the picture: the network has learned on synthetic CTs alone.
+    volumes and warnings (.json). Look at the picture: the network has learned on synthetic CTs alone, and the graph cut
+    knows no shape.
 
     Args:
         ct: CT in HU: folder of a DICOM series, or a NIfTI, NRRD or MHA file.
         out: Label map to write (.nii.gz, .nrrd, .mha).
         series: Which of several DICOM series: its number, UID, or a part of its description.
+        way: `network`, or `graph_cut`: bright sheets, minimum cuts and the heads' spheres, nothing learned.
         weights: Network weights (safetensors) that `femoreg train-segmentation` wrote; by default the shipped ones.
-        unrefined: Keep the network's outlines, on voxels of 3 mm, in place of the CT's edges.
+        unrefined: Keep the outlines of the network (voxels of 3 mm) or of the cuts (1.25 mm), not the CT's edges.
     """
     from rich.console import Console
     from rich.markup import escape
@@ -27,13 +36,15 @@ def segment(
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import check_files, temporary_files, write_json
     from femoreg_torch.intake.planes import three_planes
-    from femoreg_torch.segment import load_bone_network, segment_bones
+    from femoreg_torch.segment import load_bone_network, segment_bones, segment_bones_without_network
     from femoreg_torch.volume import read_ct_told
     from femoreg_torch.volume.reading import write_labels_like
 
     suffix = next((s for s in (".nii.gz", ".nii", ".nrrd", ".mha") if out.name.lower().endswith(s)), None)
     if suffix is None:
         raise InputError(f"{out}: the label map's name is to end in .nii.gz, .nrrd or .mha.")
+    if way == "graph_cut" and weights is not None:
+        raise InputError("--weights: are a network's, and `--way graph_cut` uses none. Leave one of the two out.")
     stem = out.name[: -len(suffix)]
 
     def beside(ending: str) -> Path:
@@ -45,10 +56,14 @@ def segment(
     console = Console(soft_wrap=True)
     volume, told = read_ct_told(ct, series)
     with console.status("looking for bones"):
-        found = segment_bones(volume, load_bone_network(weights), refine=not unrefined)
+        if way == "graph_cut":
+            found = segment_bones_without_network(volume, refine=not unrefined)
+        else:
+            found = segment_bones(volume, load_bone_network(weights), refine=not unrefined)
     about = {
         "labels": out.name,
         "table": "femoreg",
+        "way": way,
         "confidence": {bone: round(share, 3) for bone, share in found.confidence.items()},
         "volume_ml": {bone: round(volume_ml, 1) for bone, volume_ml in found.volume_ml.items()},
         "warnings": list(found.warnings),
@@ -62,7 +77,8 @@ def segment(
     for note in told:
         console.print(f"  {escape(note)}", highlight=False)
     for bone, volume_ml in found.volume_ml.items():
-        console.print(f"  {bone}: {volume_ml:.0f} ml, mean probability {found.confidence[bone]:.2f}", highlight=False)
+        sure = f", mean probability {found.confidence[bone]:.2f}" if bone in found.confidence else ""
+        console.print(f"  {bone}: {volume_ml:.0f} ml{sure}", highlight=False)
     for warning in found.warnings:
         console.print(f"[yellow]Warning:[/] {escape(warning)}.", highlight=False)
     console.print(

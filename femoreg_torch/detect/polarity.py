@@ -7,7 +7,7 @@ from torch.nn import functional as F
 _RIM = 2  # pixels of the segmentation on each side of an outline; 3.1 mm for the shipped network
 _AROUND = 9  # pixels to each side that the brightness of the surroundings is taken of
 _LEAST_RIM = 50  # pixels; of less than that nothing is said
-# Of 42 simulated images, with shutters, a table, metal and scattered light, by either reading: 0.37 to 1.38; of 30 of
+# Of 42 simulated images, with shutters, a table, metal and scattered light, by either reading: 0.37 to 1.38; of 26 of
 # another simulator, equalised ones too: 0.11 to 1.30. As much below zero with their grey values inverted.
 _SURE = 0.1
 

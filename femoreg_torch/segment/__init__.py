@@ -1,6 +1,6 @@
 """Bones and landmarks from a CT alone."""
 
-from femoreg_torch.segment.bones import Segmentation, segment_bones
+from femoreg_torch.segment.bones import Segmentation, segment_bones, segment_bones_without_network
 from femoreg_torch.segment.network import BoneNetwork, load_bone_network
 from femoreg_torch.segment.points import Proposal, propose_landmarks
 
@@ -11,4 +11,5 @@ __all__ = [
     "load_bone_network",
     "propose_landmarks",
     "segment_bones",
+    "segment_bones_without_network",
 ]

@@ -6,16 +6,20 @@ import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
+from torch.nn import functional as F
 
+from femoreg_torch.anatomy import HIP, Anatomy
 from femoreg_torch.errors import InputError
 from femoreg_torch.segment.network import BoneNetwork, bone_shares
 from femoreg_torch.segment.refine import closed_joint_mm2, refined_labels, unrefined_labels
-from femoreg_torch.volume import Volume
+from femoreg_torch.segment.without_network import bones_without_network
+from femoreg_torch.volume import Volume, resample_isotropic
 from femoreg_torch.volume.borders import cut_bones
 
 _BONE_HU, _METAL_HU = 200.0, 2800.0
 _LEAST_HIP_ML = 15.0  # of a hip bone; whole ones of adults have 180 to 400
 _LEAST_FEMUR_ML = 10.0
+_SHARES_MM = 3.0  # voxels on which the cuts' labels are averaged for the refinement; 1.5 to 2 mm gave the same
 _LEAST_CONFIDENCE = 0.6  # mean probability of a bone; with less it is left out
 _LEAST_TOLD_ML = 0.5  # of what is left out; less are specks that nobody takes for a bone
 _DOUBTED = 0.85  # mean share of a bone below which a warning is given
@@ -30,7 +34,7 @@ class Segmentation:
     """Bones found in a CT."""
 
     labels: Volume  # uint8 on the CT's grid: 0, or 1 + the bone's number in the anatomy
-    confidence: dict[str, float]  # by bone: mean probability that the network gives its voxels
+    confidence: dict[str, float]  # by bone: mean probability that the network gives its voxels; empty without one
     volume_ml: dict[str, float]  # by bone
     warnings: tuple[str, ...]
 
@@ -41,22 +45,62 @@ def segment_bones(ct: Volume, network: BoneNetwork, refine: bool = True) -> Segm
     With `refine` their edges are those of the CT (`refined_labels`), without it those of the network. Raises
     `InputError` if there is no bone, or neither a hip bone nor an upper femur.
     """
+    bright_ml = _bright_ml(ct)
+    shares, grid = bone_shares(network, ct)
+    shares = _spine_apart(_sides_told_apart(shares, network), network)
+    anatomy = network.anatomy
+    data = refined_labels(ct, shares, grid, anatomy) if refine else unrefined_labels(ct, shares, grid, anatomy)
+    present = torch.unique(data).tolist()
+    confidence = {name: _confidence(shares, 1 + n) for n, name in enumerate(anatomy.bone_names) if 1 + n in present}
+    return _looked_at(ct, data, anatomy, confidence, bright_ml)
+
+
+def segment_bones_without_network(ct: Volume, refine: bool = True) -> Segmentation:
+    """As `segment_bones`, by sheetness, graph cuts and the heads' spheres; there is no confidence.
+
+    With `refine` the edges are those of the CT, found as around a network's labels; without it those of the cuts, on
+    voxels of 1.25 mm.
+    """
+    bright_ml = _bright_ml(ct)
+    cut = bones_without_network(ct, HIP)
+    if refine:
+        grid = resample_isotropic(ct, _SHARES_MM)
+        shares = [
+            F.interpolate((cut.data == k)[None, None].float(), grid.data.shape, mode="area")[0, 0]
+            for k in range(1 + len(HIP.bones))
+        ]
+        data = refined_labels(ct, torch.stack(shares), grid, HIP)
+    else:
+        z, y, x = (
+            ((torch.arange(n) + 0.5) * (float(own) / float(other))).long().clamp(max=most - 1)
+            for n, own, other, most in zip(
+                ct.data.shape, reversed(ct.spacing_mm), reversed(cut.spacing_mm), cut.data.shape, strict=True
+            )
+        )
+        data = cut.data[z][:, y][:, :, x]
+    return _looked_at(ct, data, HIP, {}, bright_ml)
+
+
+def _bright_ml(ct: Volume) -> float:
+    """What is as bright as bone, ml. Raises `InputError` if there is next to nothing."""
     bright_ml = float((ct.data > _BONE_HU).sum()) * float(np.prod(ct.spacing_mm)) / 1000
     if bright_ml < _LEAST_FEMUR_ML:
         raise InputError(
             f"segment: only {bright_ml:.1f} ml of the CT are above {_BONE_HU:g} HU, so it holds no bone. Is it in HU?"
         )
-    shares, grid = bone_shares(network, ct)
-    shares = _spine_apart(_sides_told_apart(shares, network), network)
-    anatomy = network.anatomy
-    data = refined_labels(ct, shares, grid, anatomy) if refine else unrefined_labels(ct, shares, grid, anatomy)
+    return bright_ml
+
+
+def _looked_at(
+    ct: Volume, data: Tensor, anatomy: Anatomy, confidence: dict[str, float], bright_ml: float
+) -> Segmentation:
+    """The labels without doubtful bones, with what there is to say. Raises `InputError` if they hold no hip."""
     counts = torch.bincount(data.flatten(), minlength=1 + len(anatomy.bones)).tolist()
     voxel_ml = float(np.prod(ct.spacing_mm)) / 1000
     volume_ml = {name: n * voxel_ml for name, n in zip(anatomy.bone_names, counts[1:], strict=True) if n}
-    confidence = {name: _confidence(shares, 1 + anatomy.bone_names.index(name)) for name in volume_ml}
     doubtful = [name for name, share in confidence.items() if share < _LEAST_CONFIDENCE]
-    hips = [side for side in ("left", "right") if _is_there(volume_ml, confidence, f"hip_{side}", _LEAST_HIP_ML)]
-    femora = [side for side in ("left", "right") if _is_there(volume_ml, confidence, f"femur_{side}", _LEAST_FEMUR_ML)]
+    hips = [side for side in ("left", "right") if _is_there(volume_ml, doubtful, f"hip_{side}", _LEAST_HIP_ML)]
+    femora = [side for side in ("left", "right") if _is_there(volume_ml, doubtful, f"femur_{side}", _LEAST_FEMUR_ML)]
     if not hips or not femora:
         lacking = " and ".join(name for name, there in (("hip bone", hips), ("upper femur", femora)) if not there)
         raise InputError(
@@ -71,12 +115,12 @@ def segment_bones(ct: Volume, network: BoneNetwork, refine: bool = True) -> Segm
             told = f"{left_ml:.0f} ml, mean probability {share:.2f}"
             left_out.append(f"what may be {name} ({told}) was left out: the network is not sure")
     labels = Volume(data, ct.lps_from_index)
-    warnings = left_out + _warnings(ct, labels, network, volume_ml, confidence, hips)
+    warnings = left_out + _warnings(ct, labels, anatomy, volume_ml, confidence, hips)
     return Segmentation(labels, confidence, volume_ml, tuple(warnings))
 
 
-def _is_there(volume_ml: dict[str, float], confidence: dict[str, float], bone: str, least_ml: float) -> bool:
-    return volume_ml.get(bone, 0.0) >= least_ml and confidence.get(bone, 0.0) >= _LEAST_CONFIDENCE
+def _is_there(volume_ml: dict[str, float], doubtful: list[str], bone: str, least_ml: float) -> bool:
+    return volume_ml.get(bone, 0.0) >= least_ml and bone not in doubtful
 
 
 def _confidence(shares: Tensor, number: int) -> float:
@@ -129,12 +173,12 @@ def _spine_apart(shares: Tensor, network: BoneNetwork) -> Tensor:
 def _warnings(
     ct: Volume,
     labels: Volume,
-    network: BoneNetwork,
+    anatomy: Anatomy,
     volume_ml: dict[str, float],
     confidence: dict[str, float],
     hips: list[str],
 ) -> list[str]:
-    names = network.anatomy.bone_names
+    names = anatomy.bone_names
     ids = {name: 1 + names.index(name) for name in volume_ml}
     told = cut_bones(labels, ids, list(ids))
     if len(hips) == 1:

@@ -9,6 +9,7 @@ import pytest
 import SimpleITK as sitk
 from fuzz_faults import full_after
 from hip_scenes import FEMUR_LEFT, HEAD, RADIUS_MM, answering, dice, hip_scene, shares_of
+from pelvis_scene import pelvis_scene
 
 from femoreg_torch.commands.main import main
 from femoreg_torch.commands.segment import landmarks, segment
@@ -41,6 +42,20 @@ def test_the_label_map_lies_on_the_voxels_of_the_file(ct_in_ras: Path, tmp_path:
     assert told["table"] == "femoreg"
     assert set(told["confidence"]) == {"hip_left", "femur_left"}
     assert (tmp_path / "labels.png").stat().st_size > 1000
+
+
+def test_the_way_without_a_network_writes_the_same_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ct, truth = pelvis_scene()
+    write_volume(tmp_path / "ct.nii.gz", ct)
+    out = tmp_path / "labels.nii.gz"
+    assert main(["segment", str(tmp_path / "ct.nii.gz"), "--out", str(out), "--way", "graph_cut", "--unrefined"]) == 0
+    assert dice(read_label_map(out).data, truth, FEMUR_LEFT) > 0.85
+    told = json.loads((tmp_path / "labels.json").read_text())
+    assert told["way"] == "graph_cut"
+    assert told["confidence"] == {}
+    assert set(told["volume_ml"]) == {"hip_left", "hip_right", "sacrum", "femur_left", "femur_right"}
+    assert (tmp_path / "labels.png").stat().st_size > 1000
+    assert "mean probability" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("size", [100, 2000])
@@ -77,6 +92,11 @@ def test_the_head_is_proposed_and_what_is_not_there_left_out(
     [
         (["segment", "none.nii.gz", "--out", "labels.nii.gz"], "no such file"),
         (["segment", "none.nii.gz", "--out", "labels.png"], "is to end in .nii.gz"),
+        (
+            ["segment", "none.nii.gz", "--out", "labels.nii.gz", "--way", "graph_cut", "--weights", "w.safetensors"],
+            "Leave one of the two out",
+        ),
+        (["segment", "none.nii.gz", "--out", "labels.nii.gz", "--way", "atlas"], "atlas"),
         (["landmarks", "none.nii.gz", "none.nii.gz", "--out", "points.fcsv"], "is to end in .mrk.json"),
     ],
 )
