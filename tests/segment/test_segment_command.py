@@ -50,7 +50,7 @@ def test_the_way_without_a_network_writes_the_same_files(tmp_path: Path, capsys:
     out = tmp_path / "labels.nii.gz"
     assert main(["segment", str(tmp_path / "ct.nii.gz"), "--out", str(out), "--way", "graph_cut", "--unrefined"]) == 0
     assert dice(read_label_map(out).data, truth, FEMUR_LEFT) > 0.85
-    told = json.loads((tmp_path / "labels.json").read_text())
+    told = json.loads((tmp_path / "labels.json").read_text(encoding="utf-8"))
     assert told["way"] == "graph_cut"
     assert told["confidence"] == {}
     assert set(told["volume_ml"]) == {"hip_left", "hip_right", "sacrum", "femur_left", "femur_right"}
