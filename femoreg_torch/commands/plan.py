@@ -47,14 +47,14 @@ def plan(
         found = make_plan(prepared, volume_ml, seed, report)
     with new_folder(out) as folder:
         write_plan(folder, content, prepared, found, seed)
-        curves = {"without cement": found.optimum.baseline, "as planned": found.curve, "optimum": found.optimum.curve}
+        curves = {"without cement": found.baseline, "as planned": found.curve, "optimum": found.optimum_curve}
         save(curves_figure(curves), folder / "curves.png")
         save(overlay_figure(prepared, found), folder / "overlay.png")
     calibration = prepared.bone.calibration.kind
     console.print(
-        f"Modelled yield load {found.optimum.baseline.yield_load_n:.0f} N without cement, "
+        f"Modelled yield load {found.baseline.yield_load_n:.0f} N without cement, "
         f"{found.curve.yield_load_n:.0f} N with {volume_ml:g} ml as planned ({100 * found.gain:+.1f} %), "
-        f"{found.optimum.curve.yield_load_n:.0f} N at the free optimum ({100 * found.optimum_gain:+.1f} %)."
+        f"{found.optimum_curve.yield_load_n:.0f} N at the free optimum ({100 * found.optimum_gain:+.1f} %)."
     )
     doubt = (
         "" if calibration == "phantom" else ", not by a phantom: trust no load in N, and compare within this CT only"

@@ -1,15 +1,11 @@
 """The same femur and cement on a mesh of another size: how far load and gain hang on the mesh, and what it costs."""
 
-import dataclasses
 import time
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from femoreg_torch.planning.curve import Press
-from femoreg_torch.planning.loading import make_loading
-from femoreg_torch.planning.model import make_model
 from femoreg_torch.planning.prepare import Prepared
 
 Array = NDArray[np.float64]
@@ -31,13 +27,9 @@ def on_mesh(prepared: Prepared, cement: Array, size_mm: float) -> MeshRow:
 
     Raises `InputError` for a mesh with more elements than the settings allow.
     """
-    bone, planning = prepared.bone, prepared.planning
-    model = make_model(bone, planning, size_mm)
-    loading = make_loading(model, bone.femur, planning.load)
-    press = Press(model.mesh, loading, planning.bone.poisson, prepared.press.device)
-    other = dataclasses.replace(prepared, model=model, press=press)
+    other = prepared.on_elements(size_mm)
     began = time.process_time()
     without = other.curve().yield_load_n
     gain = other.curve(cement).yield_load_n / without - 1
     seconds = (time.process_time() - began) / 2
-    return MeshRow(float(size_mm), len(model.mesh.elements), without, gain, seconds)
+    return MeshRow(float(size_mm), len(other.model.mesh.elements), without, gain, seconds)

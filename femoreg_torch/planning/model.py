@@ -95,20 +95,19 @@ def check_volume(bone: Bone, volume_ml: float) -> None:
         )
 
 
-def make_model(bone: Bone, planning: Planning, size_mm: float | None = None) -> Model:
-    """The mesh of a bone. Raises `InputError` if it has more elements than allowed."""
+def make_model(bone: Bone, planning: Planning, size_mm: float) -> Model:
+    """The mesh of a bone, with elements of some size. Raises `InputError` if it has more elements than allowed."""
     settings = planning.mesh
-    size = settings.size_mm if size_mm is None else size_mm
     femur = bone.femur
-    grid = blocks(femur, size)
+    grid = blocks(femur, size_mm)
     kept_voxels = femur.mask & _above(femur, settings.shaft_mm)
     fill = grid.mean(kept_voxels)
     kept = fill >= settings.least_fill
     pieces, count = ndimage.label(kept)
     if count > 1:
         kept = pieces == 1 + int(np.bincount(pieces.ravel())[1:].argmax())
-    too_many(int(kept.sum()), settings.most_elements, size)
-    mesh = mesh_of(size, kept, grid.lps_from_mm[:3, :3], grid.lps_from_mm[:3, 3])
+    too_many(int(kept.sum()), settings.most_elements, size_mm)
+    mesh = mesh_of(size_mm, kept, grid.lps_from_mm[:3, :3], grid.lps_from_mm[:3, 3])
     ash = mesh.of(grid.mean(np.where(kept_voxels, bone.ash, 0.0)))
     material = Material(*(mesh.of(part) for part in _hill(grid, kept_voxels, _parts(bone.material))))
     fill_at_points = mesh.of(grid.octants(kept_voxels))

@@ -23,22 +23,35 @@ class FemoroplastyPlan:
     """What is to be drilled and injected, and the loads of the femur without cement, at the optimum, and as planned."""
 
     volume_ml: float
-    optimum: Distribution
+    optimum: Distribution  # its loads are those of the elements of the search
     path: Path
     clearances: Clearances
     cement: Array  # (X, Y, Z) share of the voxels' pores, after diffusion
+    baseline: Curve  # without cement
     curve: Curve  # with that cement
-    polished: tuple[float, ...]  # yield loads of the paths that were tried, in order
+    optimum_curve: Curve  # with that of the free optimum
+    tried_n: tuple[float, ...]  # yield loads of the paths that were tried, in order, on the elements of the search
+    compared_n: tuple[float, ...]  # of the best of them, from the best on
 
     @property
     def gain(self) -> float:
         """Yield load with cement over that without, minus 1."""
-        return self.curve.yield_load_n / self.optimum.baseline.yield_load_n - 1
+        return self.curve.yield_load_n / self.baseline.yield_load_n - 1
 
     @property
     def optimum_gain(self) -> float:
         """The same of the free optimum."""
-        return self.optimum.curve.yield_load_n / self.optimum.baseline.yield_load_n - 1
+        return self.optimum_curve.yield_load_n / self.baseline.yield_load_n - 1
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """A path that was found, what it injects, and what it is worth on the elements of the search."""
+
+    parameters: Array
+    path: Path
+    cement: Array
+    load_n: float
 
 
 def make_plan(
@@ -48,41 +61,65 @@ def make_plan(
 
     A femur gives way in head, neck or trochanter, whichever is weakest, so cement that serves one mechanism alone gains
     little. The search for a path takes the least load over all mechanisms that were seen so far, an upper bound of what
-    the path is worth; the whole model then tells its worth, and by which mechanism it fails. The best one counts.
-    Same seed, same plan. Raises `InputError` if the volume does not fit or no path keeps its limits.
+    the path is worth; the whole model then tells its worth, and by which mechanism it fails.
+
+    A search finds what its own elements make too much of: on a real femur a path gained 35 % on elements of 3 mm, on
+    which it was sought, and 31 % on those of 2 and 1.5 mm. So the best `path.compared` paths are compared on finer
+    elements, those of `prepared`, and all loads of the plan are told by them. Same seed, same plan. Raises `InputError`
+    if the volume does not fit or no path keeps its limits.
     """
-    bone, model, planning = prepared.bone, prepared.model, prepared.planning
+    planning = prepared.planning
+    searched = prepared.on_elements(planning.mesh.search_mm)
+    bone, model = searched.bone, searched.model
     rng = np.random.default_rng(seed)
     optimum = optimise(
-        bone, model, prepared.press, volume_ml, planning, lambda share: progress("optimal cement", 0.5 * share)
+        bone, model, searched.press, volume_ml, planning, lambda share: progress("optimal cement", 0.35 * share)
     )
     around = Surroundings(bone)
     mechanisms = list(optimum.mechanisms)
-    tried: list[tuple[Array, Path, Array, Curve]] = []
+    tried: list[_Tried] = []
     searches = 1 + planning.path.polish
     for n in range(searches):
         worth = places(bone, model, mechanisms, planning.cement)
         planner = Planner(around, worth, volume_ml, planning.path)
-        start = max(tried, key=_load)[0] if tried else None
+        start = max(tried, key=_load).parameters if tried else None
         x = planner.search(rng, _within(progress, n / searches, 1 / searches), start)
         path = planner.path(x)
         cement = diffuse(bone, path.injections(), planning.diffusion)
         material = with_cement(model, bone, cement, planning.cement)
-        tried.append((x, path, cement, prepared.press.curve(material, planning.curve)))
-        mechanisms.append(mechanism(tried[-1][3], material))
-    _, path, cement, curve = max(tried, key=_load)
-    clearances = around.clearances(path, planning.path)
-    loads = tuple(_load(each) for each in tried)
-    return FemoroplastyPlan(volume_ml, optimum, path, clearances, cement, curve, loads)
+        curve = searched.press.curve(material, planning.curve)
+        tried.append(_Tried(x, path, cement, curve.yield_load_n))
+        mechanisms.append(mechanism(curve, material))
+    best = sorted(tried, key=_load, reverse=True)[: planning.path.compared]
+    told = []
+    for n, placed in enumerate([None, optimum.cement, *(each.cement for each in best)]):
+        told.append(prepared.curve(placed))
+        progress("loads on finer elements", 0.7 + 0.3 * (n + 1) / (2 + len(best)))
+    baseline, optimum_curve, *curves = told
+    loads = tuple(curve.yield_load_n for curve in curves)
+    first = int(np.argmax(loads))
+    chosen = best[first]
+    return FemoroplastyPlan(
+        volume_ml,
+        optimum,
+        chosen.path,
+        around.clearances(chosen.path, planning.path),
+        chosen.cement,
+        baseline,
+        curves[first],
+        optimum_curve,
+        tuple(_load(each) for each in tried),
+        loads,
+    )
 
 
 def _within(progress: Progress, begun: float, share: float) -> Callable[[float], None]:
-    """Progress of one search, as a part of the second half of all."""
-    return lambda part: progress("path", 0.5 + 0.5 * (begun + share * part))
+    """Progress of one search, as a part of that of all."""
+    return lambda part: progress("path", 0.35 + 0.35 * (begun + share * part))
 
 
-def _load(tried: tuple[Array, Path, Array, Curve]) -> float:
-    return tried[3].yield_load_n
+def _load(tried: _Tried) -> float:
+    return tried.load_n
 
 
 def until_yield(prepared: Prepared) -> Prepared:

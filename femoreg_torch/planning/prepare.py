@@ -1,5 +1,6 @@
 """From a case on disk to a femur under its pads."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,13 @@ class Prepared:
             material = with_cement(self.model, self.bone, cement, self.planning.cement)
         return self.press.curve(material, self.planning.curve)
 
+    def on_elements(self, size_mm: float) -> "Prepared":
+        """The same femur on elements of another size. Raises `InputError` if they are too many."""
+        if size_mm == self.model.mesh.size_mm:
+            return self
+        model, press = _pressed(self.bone, self.planning, size_mm, self.press.device)
+        return dataclasses.replace(self, model=model, press=press)
+
     def on_ct(self, cement: Array) -> Volume:
         """The label map (0 or 1) of voxels with half of their pores or more in cement, on the grid of the whole CT."""
         data = np.zeros(self.ct.data.shape[::-1], np.uint8)
@@ -48,8 +56,10 @@ class Prepared:
         return self.ct.with_data(torch.from_numpy(np.ascontiguousarray(data.transpose(2, 1, 0))))
 
 
-def prepare(case: Case, planning: Planning, size_mm: float | None = None, device: torch.device = CPU) -> Prepared:
+def prepare(case: Case, planning: Planning, device: torch.device = CPU) -> Prepared:
     """Read CT and labels of a case and build the model of the femur of its side; `device` solves its linear systems.
+
+    The model has elements of `planning.mesh.size_mm`.
 
     Raises `InputError` for a case without side or head centre, and for what its CT and label map do not allow.
     """
@@ -63,7 +73,12 @@ def prepare(case: Case, planning: Planning, size_mm: float | None = None, device
     head = case.landmarks[name].numpy()
     femur = cut_out(ct, bones.labels, number, head, case.side, planning.mesh.shaft_mm)
     bone = make_bone(femur, calibrate(ct.data.numpy(), planning.calibration), planning)
-    model = make_model(bone, planning, size_mm)
-    loading = make_loading(model, femur, planning.load)
-    press = Press(model.mesh, loading, planning.bone.poisson, device)
+    model, press = _pressed(bone, planning, planning.mesh.size_mm, device)
     return Prepared(ct, bone, model, press, planning)
+
+
+def _pressed(bone: Bone, planning: Planning, size_mm: float, device: torch.device) -> tuple[Model, Press]:
+    """A bone's model on elements of some size, and its pads."""
+    model = make_model(bone, planning, size_mm)
+    loading = make_loading(model, bone.femur, planning.load)
+    return model, Press(model.mesh, loading, planning.bone.poisson, device)

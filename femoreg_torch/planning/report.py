@@ -53,9 +53,14 @@ def plan_content(case: Case, prepared: Prepared, plan: FemoroplastyPlan, seed: i
         "calibration": dataclasses.asdict(calibration),
         "calibrated": calibration.kind == "phantom",
         "elements": len(prepared.model.mesh.elements),
-        "baseline": curve_content(plan.optimum.baseline),
-        "optimum": curve_content(plan.optimum.curve) | {"gain": plan.optimum_gain, "loads_n": plan.optimum.loads_n},
-        "planned": curve_content(plan.curve) | {"gain": plan.gain, "tried_n": plan.polished},
+        "baseline": curve_content(plan.baseline),
+        "optimum": curve_content(plan.optimum_curve) | {"gain": plan.optimum_gain, "loads_n": plan.optimum.loads_n},
+        "planned": curve_content(plan.curve)
+        | {
+            "gain": plan.gain,
+            "tried_n": plan.tried_n,
+            "compared_n": plan.compared_n,
+        },
         "frame": {
             "head": femur.frame.head,
             "head_radius": femur.frame.head_radius,
@@ -170,7 +175,7 @@ def _write_fields(file: File, prepared: Prepared, plan: FemoroplastyPlan) -> Non
         "strength_mpa": model.material.tension.mean(1),
         "cement": model.cement_share(plan.cement).mean(1),
         "optimum": model.cement_share(plan.optimum.cement).mean(1),
-        "plastic_strain_without": plan.optimum.baseline.plastic.mean(1),
+        "plastic_strain_without": plan.baseline.plastic.mean(1),
         "plastic_strain_planned": plan.curve.plastic.mean(1),
     }
     written = meshio.Mesh(
@@ -178,7 +183,7 @@ def _write_fields(file: File, prepared: Prepared, plan: FemoroplastyPlan) -> Non
         [("hexahedron", mesh.elements[:, order])],
         cell_data={name: [values] for name, values in cells.items()},
         point_data={
-            "displacement_without": plan.optimum.baseline.last.u @ mesh.axes.T,
+            "displacement_without": plan.baseline.last.u @ mesh.axes.T,
             "displacement_planned": plan.curve.last.u @ mesh.axes.T,
         },
     )

@@ -34,13 +34,13 @@ def in_the_neck(prepared: Prepared) -> np.ndarray:
     return (near & prepared.bone.marrow).astype(float)
 
 
-def test_the_first_row_is_the_model_itself(
+def test_a_row_is_the_model_on_such_elements(
     solids: tuple[Volume, Volume, np.ndarray], femur: Femur, planning: Planning
 ) -> None:
     quick = dataclasses.replace(planning, curve=dataclasses.replace(planning.curve, step_mm=0.5))
     prepared = prepared_femur(solids[0], femur, quick, 8.0)
     cement = in_the_neck(prepared)
-    row = on_mesh(prepared, cement, 8.0)
+    row = on_mesh(prepared_femur(solids[0], femur, quick, 9.0), cement, 8.0)
     assert row.size_mm == 8.0
     assert row.elements == len(prepared.model.mesh.elements)
     assert row.baseline_n == prepared.curve().yield_load_n

@@ -44,9 +44,9 @@ from femoreg_torch.volume import Volume, read_ct, read_label_map, write_landmark
 
 PRESET = """extends: default
 calibration: {kind: uncalibrated}
-mesh: {size_mm: 7}
+mesh: {size_mm: 6, search_mm: 7}
 distribution: {steps: 2}
-path: {evaluations: 360, polish: 1, lowest_entry_mm: 70, clearance_mm: 4}
+path: {evaluations: 360, polish: 1, compared: 2, lowest_entry_mm: 70, clearance_mm: 4}
 diffusion: {voxel_mm: 3}
 offsets: {distance_mm: 4}
 """
@@ -97,10 +97,19 @@ def written(folder: File, prepared: Prepared, plan: FemoroplastyPlan) -> File:
 
 def test_no_cement_no_gain_and_cement_gains(prepared: Prepared, plan: FemoroplastyPlan) -> None:
     nothing = prepared.curve(np.zeros(plan.cement.shape))
-    assert nothing.yield_load_n == plan.optimum.baseline.yield_load_n
+    assert nothing.yield_load_n == plan.baseline.yield_load_n
     assert 0 < plan.gain < plan.optimum_gain
     assert plan.optimum.loads_n[0] < plan.optimum.loads_n[1] < plan.optimum.loads_n[2]
-    assert plan.curve.yield_load_n == max(plan.polished)
+
+
+def test_loads_are_told_by_finer_elements_than_those_of_the_search(prepared: Prepared, plan: FemoroplastyPlan) -> None:
+    searched = prepared.on_elements(7.0)
+    assert len(prepared.model.mesh.elements) > len(searched.model.mesh.elements)
+    assert plan.optimum.baseline.yield_load_n == searched.curve().yield_load_n != plan.baseline.yield_load_n
+    assert plan.optimum_curve.yield_load_n == prepared.curve(plan.optimum.cement).yield_load_n
+    assert len(plan.tried_n) == len(plan.compared_n) == 2
+    assert plan.curve.yield_load_n == max(plan.compared_n)
+    assert searched.curve(plan.cement).yield_load_n in plan.tried_n
 
 
 def test_the_cement_is_as_much_as_was_asked_and_in_the_marrow(prepared: Prepared, plan: FemoroplastyPlan) -> None:
@@ -134,7 +143,7 @@ def test_the_optimum_beats_cement_anywhere_else(prepared: Prepared, plan: Femoro
     chosen = np.zeros(len(order))
     chosen[order[sums < ML]] = 1
     elsewhere[bone.marrow] = chosen
-    assert prepared.curve(elsewhere).yield_load_n < plan.optimum.curve.yield_load_n
+    assert prepared.curve(elsewhere).yield_load_n < plan.optimum_curve.yield_load_n
 
 
 def test_the_path_keeps_its_limits(prepared: Prepared, plan: FemoroplastyPlan) -> None:
@@ -154,7 +163,8 @@ def test_the_path_keeps_its_limits(prepared: Prepared, plan: FemoroplastyPlan) -
 
 
 def planner(prepared: Prepared, plan: FemoroplastyPlan, **limits: Any) -> Planner:
-    worth = places(prepared.bone, prepared.model, plan.optimum.mechanisms, prepared.planning.cement)
+    searched = prepared.on_elements(prepared.planning.mesh.search_mm)
+    worth = places(prepared.bone, searched.model, plan.optimum.mechanisms, prepared.planning.cement)
     return Planner(Surroundings(prepared.bone), worth, ML, dataclasses.replace(prepared.planning.path, **limits))
 
 

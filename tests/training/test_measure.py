@@ -43,7 +43,7 @@ class Planted(nn.Module):
 
 
 def images() -> Tensor:
-    """Two images, bright above, that rise to the left and to the right, with a bright bone at the left edge, as `Planted` is told."""
+    """Two images, bright above, that rise to the left and to the right, with a bright bone at the left edge."""
     row, column = torch.meshgrid(torch.arange(192.0), torch.arange(192.0), indexing="ij")
     bone = 200 * ((row >= 10) & (row < 30) & (column < 20))
     return torch.stack([-3 * row - column, -3 * row + column]) + bone
