@@ -283,4 +283,4 @@ def _argument(parameter: inspect.Parameter, hint: Any) -> tuple[list[str], dict[
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    console_script()

@@ -28,7 +28,7 @@ def test_valid_files_are_taken(tmp_path: Path) -> None:
 
 def test_broken_files_are_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """In a process of its own, which forks: threads of this one would not be there after a fork."""
-    one_thread = dict.fromkeys(("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+    one_thread = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
     environment = os.environ | one_thread | {"PYTHONPATH": os.pathsep.join(sys.path), "TMPDIR": str(tmp_path)}
     command = [sys.executable, fuzz_run.__file__, str(SEED), str(COUNT)]
     told = json.loads(subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout)

@@ -266,7 +266,7 @@ def test_files_tell_the_plan(
     assert len(fields.cells[0].data) == len(prepared.model.mesh.elements)
     corners = fields.points[fields.cells[0].data[0]]
     sides = np.linalg.norm(corners - np.roll(corners, -1, 0), axis=1)
-    np.testing.assert_allclose(sides[[0, 1, 2, 4, 5, 6]], 7.0)  # VTK's order: round the bottom, then round the top
+    np.testing.assert_allclose(sides[[0, 1, 2, 4, 5, 6]], 6.0)  # VTK's order: round the bottom, then round the top
     stored = read_plan(written)
     assert stored.planning == prepared.planning
     assert stored.path.length_mm == pytest.approx(plan.path.length_mm)
