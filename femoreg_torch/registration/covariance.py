@@ -78,12 +78,7 @@ class PoseCovariance:
 
         What moves both together, as a wrong source distance does, does not count.
         """
-        i, j = (6 * self.bodies.index(each) for each in (name, other))
-        arm = self.centres[i // 6] - self.centres[j // 6]
-        response = self.matrix.new_zeros(3, len(self.matrix))
-        response[:, i + 3 : i + 6] = torch.eye(3)
-        response[:, j + 3 : j + 6] -= torch.eye(3)
-        response[:, j : j + 3] += skew(arm) * torch.pi / 180  # − ω × arm
+        response = self._beside(name, other, self.centre(name))[3:]
         return (response @ self.matrix @ response.T).diagonal().clamp(min=0).sqrt().tolist()
 
     def beside(self, name: str, other: str, point: Tensor, images_only: bool) -> Tensor:
@@ -93,18 +88,31 @@ class PoseCovariance:
         together does not count. `images_only`: as if the intrinsics were certain.
         """
         matrix = self.images if images_only else self.matrix
-        response = matrix.new_zeros(6, len(matrix))
-        for body, sign in ((name, 1.0), (other, -1.0)):
-            i = 6 * self.bodies.index(body)
-            response[:3, i + 3 : i + 6] += sign * torch.eye(3)
-            response[:3, i : i + 3] -= sign * skew(point - self.centres[i // 6]) * torch.pi / 180  # ω × arm
-            response[3:, i : i + 3] += sign * torch.eye(3)
+        response = self._beside(name, other, point).roll(3, 0)
         return response @ matrix @ response.T
 
-    def pull(self, name: str) -> tuple[float, float]:
-        """Degrees and mm that all images together would move one body by, were all bodies free."""
+    def centre(self, name: str) -> Tensor:
+        """What a body turns about (3,), mm in its camera."""
+        return self.centres[self.bodies.index(name)]
+
+    def pull(self, name: str) -> Tensor:
+        """The motion (6,) about its centre, degrees and mm, that all images would give one body, were all free."""
         i = 6 * self.bodies.index(name)
-        return float(self.step[i : i + 3].norm()), float(self.step[i + 3 : i + 6].norm())
+        return self.step[i : i + 6]
+
+    def pull_beside(self, name: str, other: str) -> Tensor:
+        """The same of one object, seen from another: what moves both together does not count."""
+        return self._beside(name, other, self.centre(name)) @ self.step
+
+    def _beside(self, name: str, other: str, point: Tensor) -> Tensor:
+        """What takes the motions of all bodies to that of one object seen from another at a point (3,), (6, 6 B)."""
+        response = self.matrix.new_zeros(6, len(self.matrix))
+        for body, sign in ((name, 1.0), (other, -1.0)):
+            i = 6 * self.bodies.index(body)
+            response[:3, i : i + 3] += sign * torch.eye(3)
+            response[3:, i + 3 : i + 6] += sign * torch.eye(3)
+            response[3:, i : i + 3] -= sign * skew(point - self.centres[i // 6]) * torch.pi / 180  # ω × arm
+        return response
 
 
 @dataclass(frozen=True, eq=False)

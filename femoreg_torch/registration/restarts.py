@@ -26,7 +26,13 @@ def restarts_of(
 
 
 def _apart(scene: Scene, body: Body, first: Poses, second: Poses) -> tuple[float, float]:
-    """Degrees and mm between two poses of what a body moves, in the camera that it moves in."""
+    """Degrees and mm between two poses of what a body moves, in the camera that it moves in.
+
+    Of a round object its turn about its own axis does not count.
+    """
     name = next(iter(body.objects or first.camera1_from))
+    moved = scene.objects[name]
     before, after = (poses.camera_from(name)[body.view] for poses in (first, second))
-    return pose_difference(before, after, scene.objects[name].reference_point)
+    if moved.axis is not None and body.objects:
+        return moved.axis.difference(before, after)
+    return pose_difference(before, after, moved.reference_point)

@@ -28,6 +28,13 @@ class Axis:
     point: Tensor  # (3,) mm
     direction: Tensor  # (3,) unit vector
 
+    def difference(self, first: Tensor, second: Tensor) -> tuple[float, float]:
+        """Degrees between the axis at two poses (4, 4), and mm between where they have the axis' point."""
+        before, after = (pose[:3, :3] @ self.direction for pose in (first, second))
+        angle = torch.atan2(torch.linalg.cross(before, after).norm(), before @ after)
+        apart = transform_points(second, self.point[None]) - transform_points(first, self.point[None])
+        return float(torch.rad2deg(angle)), float(apart.norm())
+
     def without_turn(self, pose: Tensor, centre: Tensor) -> Tensor:
         """(6, 6): takes a motion (degrees, mm) about `centre` (3,) to what it moves besides a turn about the axis.
 

@@ -64,8 +64,29 @@ def test_a_device_held_in_a_wrong_place_is_pulled_back(solutions: tuple[list[Pos
     first = 6 * settled.bodies.index("device") + 3
     back = (pulled.step - settled.step)[first : first + 2]
     torch.testing.assert_close(back, torch.tensor([-0.4, 0.3], dtype=torch.float64), atol=0.15, rtol=0)
-    assert pulled.pull("device")[1] > settled.pull("device")[1]
-    assert pulled.pull("pelvis")[1] < 0.15
+    assert pulled.pull("device")[3:].norm() > settled.pull("device")[3:].norm()
+    assert pulled.pull("pelvis")[3:].norm() < 0.15
+
+
+def test_what_pulls_all_objects_alike_pulls_none_beside_another(
+    solutions: tuple[list[Poses], PoseCovariance],
+) -> None:
+    """A turn about the pelvis and a shift carry device and femur along; what the device does besides is told."""
+    _, covariance = solutions
+    turn, shift = torch.tensor([0.1, -0.4, 0.3]).double(), torch.tensor([0.2, 0.1, 1.5]).double()
+    step = torch.zeros_like(covariance.step)
+    for name in ("pelvis", "femur", "device"):
+        i = 6 * covariance.bodies.index(name)
+        arm = covariance.centre(name) - covariance.centre("pelvis")
+        step[i : i + 6] = torch.cat([turn, shift + torch.linalg.cross(torch.deg2rad(turn), arm)])
+    alike = replace(covariance, step=step)
+    for name in ("femur", "device"):
+        assert alike.pull(name)[3:].norm() > 1
+        torch.testing.assert_close(alike.pull_beside(name, "pelvis"), torch.zeros(6).double(), atol=1e-9, rtol=0)
+    own = torch.tensor([0.0, 0.2, 0, 0.3, 0, -0.6]).double()
+    i = 6 * covariance.bodies.index("device")
+    besides = replace(alike, step=step.index_add(0, torch.arange(i, i + 6), own))
+    torch.testing.assert_close(besides.pull_beside("device", "pelvis"), own)
 
 
 def test_what_is_unsure_of_a_device_counts_as_what_it_does_to_its_pose() -> None:

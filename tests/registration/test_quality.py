@@ -67,6 +67,7 @@ def test_a_femur_out_of_its_joint_is_not_trusted(scene: Scene) -> None:
         most_pull_mm=far,
         most_common_pull_mm=far,
         most_common_pull_deg=far,
+        most_common_depth_pull_mm=far,
         most_deviation_mm=far,
         most_deviation_deg=far,
     )

@@ -76,10 +76,24 @@ def test_a_turn_that_is_left_open_is_not_held_against_a_round_object() -> None:
     nothing = IntrinsicsEstimate(torch.zeros(1), torch.zeros(1))
     covariance = PoseCovariance(("needle",), images, images, MIDDLE[None], nothing, 30 * open_turn)
     poses = Poses(EYE[None], {"needle": EYE})
-    asked = _Judged.of(covariance, poses, "needle", None)
+    asked = _Judged.of(covariance, poses, "needle", None, "pelvis")
     assert max(asked.rotation) > 10
-    assert asked.pull[0] == pytest.approx(30)
-    round_one = _Judged.of(covariance, poses, "needle", Axis(MIDDLE, AXIS))
+    assert float(asked.pull[:3].norm()) == pytest.approx(30)
+    round_one = _Judged.of(covariance, poses, "needle", Axis(MIDDLE, AXIS), "pelvis")
     assert max(round_one.rotation) < 0.11
     assert max(round_one.translation) == pytest.approx(0.1)
-    assert round_one.pull == pytest.approx((0, 0), abs=1e-9)
+    assert round_one.pull.abs().max() < 1e-9
+
+
+def test_poses_of_a_round_object_are_as_far_apart_as_their_axes() -> None:
+    axis = Axis(MIDDLE, AXIS)
+    turned, shifted = torch.eye(4).double(), torch.eye(4).double()
+    turned[:3, :3] = exp_so3(2.0 * AXIS)
+    turned[:3, 3] = MIDDLE - turned[:3, :3] @ MIDDLE  # about the axis
+    shifted[:3, 3] = torch.tensor([0.0, 3.0, 4.0])
+    assert axis.difference(EYE, turned) == pytest.approx((0, 0), abs=1e-5)
+    assert axis.difference(EYE, shifted @ turned) == pytest.approx((0, 5), abs=1e-5)
+    tilt = torch.linalg.cross(AXIS, torch.tensor([1.0, 2.0, 3.0]).double())
+    tilted = torch.eye(4).double()
+    tilted[:3, :3] = exp_so3(0.3 * tilt / tilt.norm())
+    assert axis.difference(EYE, tilted @ turned)[0] == pytest.approx(math.degrees(0.3))
