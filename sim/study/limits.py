@@ -163,8 +163,11 @@ def imagine(setting: Setting, procedure: Procedure, body: Body, scratch: Path, p
     content = simulation_of(setting.variation, setting.simulation)
     settings = read_record(Simulation, content, f"condition {setting.variation.name}")
     acquisition = settings.acquisition
-    if acquisition.moved_deg or acquisition.moved_mm or acquisition.table_parts:
-        raise InputError("bound: patients that move between images, and tables with parts, are not known here.")
+    moves = (acquisition.moved_deg, acquisition.moved_mm, acquisition.device_moved_deg, acquisition.device_moved_mm)
+    if any(moves) or acquisition.table_parts:
+        raise InputError(
+            "bound: patients and devices that move between images, and tables with parts, are not known here."
+        )
     known = read_preoperative(body.patient(), procedure.hip, body.device_seed, settings, scratch / f"{DEVICE}.stl")
     mesh = read_mesh(known.device.model.path)
     drawn = draw_procedure(known, mesh, acquisition, torch.Generator().manual_seed(procedure.seed))

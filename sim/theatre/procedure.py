@@ -34,7 +34,7 @@ class Procedure:
 
     camera_from_pelvis: Tensor  # (V, 4, 4)
     camera1_from_femur: Tensor  # (4, 4)
-    camera_from_device: Tensor  # (V, 4, 4)
+    camera_from_device: Tensor  # (V, 4, 4); it may move between the views
     femur_rotation: Tensor  # (3, 3), in LPS about the femoral head centre
     lps_moved: Tensor | None = None  # (4, 4): how the patient has moved before the images with the device
 
@@ -70,7 +70,12 @@ def draw_procedure(
     for _ in range(_TRIES):
         camera_from_device = camera_from_camera1 @ about_point(settings.device.draw(generator), centre) @ nominal
         if _inside(mesh, camera_from_device, carm, settings.device_margin_mm):
-            moved = _draw_move(known.head, settings, generator)
+            moved = _draw_move(known.head, settings.moved_deg, settings.moved_mm, generator)
+            place = known.device.points["center"]
+            for view in range(1, len(camera_from_device)):
+                drift = _draw_move(place, settings.device_moved_deg, settings.device_moved_mm, generator)
+                if drift is not None:
+                    camera_from_device[view] @= drift
             return Procedure(camera_from_pelvis, camera1_from_femur, camera_from_device, femur_motion[:3, :3], moved)
     raise InputError(
         f"simulation: the device never lies inside all images at {settings.device_depth_mm:g} mm from the source. "
@@ -88,13 +93,12 @@ def draw_stops(carm: CArm, settings: Acquisition, generator: torch.Generator) ->
     return stops
 
 
-def _draw_move(head: Tensor, settings: Acquisition, generator: torch.Generator) -> Tensor | None:
-    """A turn about the femoral head and a shift (4, 4) of just the sizes that the settings say, if any."""
-    if not (settings.moved_deg or settings.moved_mm):
+def _draw_move(pivot: Tensor, deg: float, mm: float, generator: torch.Generator) -> Tensor | None:
+    """A turn about a point (3,) and a shift (4, 4) of just these sizes, in random directions, if any."""
+    if not (deg or mm):
         return None
     axis, direction = F.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=1)
-    turn = exp_so3(math.radians(settings.moved_deg) * axis)
-    return about_point(rigid(turn, settings.moved_mm * direction), head)
+    return about_point(rigid(exp_so3(math.radians(deg) * axis), mm * direction), pivot)
 
 
 def _inside(mesh: trimesh.Trimesh, camera_from_device: Tensor, carm: CArm, margin_mm: float) -> bool:

@@ -53,6 +53,8 @@ class Acquisition:
     table_parts: bool = False
     moved_deg: float = 0.0
     moved_mm: float = 0.0
+    device_moved_deg: float = 0.0
+    device_moved_mm: float = 0.0
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.orbit_deg) <= 100:
@@ -69,6 +71,8 @@ class Acquisition:
             step_mm=(0.05, 20),
             moved_deg=(0, 180),
             moved_mm=(0, 500),
+            device_moved_deg=(0, 180),
+            device_moved_mm=(0, 500),
         )
 
 

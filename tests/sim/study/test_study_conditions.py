@@ -15,7 +15,7 @@ from femoreg_torch.case import read_case
 from femoreg_torch.case.femoroplasty import device_of
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import read_image
-from femoreg_torch.geometry import rotation_angle, transform_points
+from femoreg_torch.geometry import pose_difference, rotation_angle, transform_points
 from femoreg_torch.volume import read_ct, read_mesh
 from sim.study import conditions as module
 from sim.study.cases import Stores
@@ -170,6 +170,25 @@ def test_the_patient_moves_by_just_so_much_between_the_images(stores: Stores, tm
     head = known.head[None]
     assert (transform_points(moved.lps_moved, head) - head).norm().item() == pytest.approx(2)
     assert torch.equal(still.camera_from_device, moved.camera_from_device)
+
+
+def test_a_device_held_by_hand_moves_by_just_so_much_in_each_view_after_the_first(
+    stores: Stores, tmp_path: Path
+) -> None:
+    paper = load_simulation("paper")
+    known = read_preoperative(stores.patients / "somebody" / "1.0", "right", 2, paper, tmp_path / "device.stl")
+    mesh = read_mesh(known.device.model.path)
+    held = replace(paper.acquisition, device_moved_deg=1.0, device_moved_mm=2.0)
+    still, moved = (
+        draw_procedure(known, mesh, settings, torch.Generator().manual_seed(5))
+        for settings in (paper.acquisition, held)
+    )
+    apart = [
+        pose_difference(*views, known.device.points["center"])
+        for views in zip(still.camera_from_device, moved.camera_from_device, strict=True)
+    ]
+    assert apart == [pytest.approx((0, 0), abs=1e-6), *[pytest.approx((1, 2))] * 2]
+    assert torch.equal(still.camera_from_pelvis, moved.camera_from_pelvis)
 
 
 def test_another_condition_of_a_name_and_an_unknown_name_are_refused(
