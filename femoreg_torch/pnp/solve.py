@@ -23,7 +23,7 @@ from femoreg_torch.geometry import Camera, project_points, transform_points
 Array = NDArray[np.float64]
 
 MINIMUM = 4  # points that must agree
-_INLIER_MM = 10.0  # on the detector; twice the mean error of published landmark networks
+INLIER_MM = 10.0  # on the detector; twice the mean error of published landmark networks
 _HUBER_MM = 3.0  # on the detector, where the loss turns from square to linear
 _FLOOR_MM = 1.0  # least standard deviation of a landmark that the covariance assumes, on the detector
 _HYPOTHESES = 400
@@ -82,7 +82,7 @@ def solve_pnp(
     object_points, image_points = (p.to(torch.float64).numpy() for p in (points, pixels))
     scale = weights.to(torch.float64).numpy()
     pixel_mm = float(np.mean(camera.pixel_mm))
-    limit_px = _INLIER_MM / pixel_mm
+    limit_px = INLIER_MM / pixel_mm
 
     along = np.asarray(beam, dtype=np.float64)
     pose = _consensus(object_points, image_points, scale, camera, limit_px, along)

@@ -39,6 +39,11 @@ class SilhouetteFit:
     overlap: float  # Dice in the band about the bone that is seen
     covariance: Tensor  # (6, 6) of (rotation in rad, translation in mm), camera axes, about the centre given
 
+    @property
+    def rotation_deviation_deg(self) -> float:
+        """Standard deviation of the rotation, over all axes."""
+        return float(torch.rad2deg(self.covariance[:3, :3].trace().sqrt()))
+
 
 def outline_of(bones: BoneLabels, anatomy: Anatomy | None) -> Outline | None:
     """Those bones of a label map that the anatomy compares outlines by, on coarse voxels.

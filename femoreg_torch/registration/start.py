@@ -13,7 +13,7 @@ from femoreg_torch.detect import Detection, as_stored, filled, within_field
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import SOURCES, Display
 from femoreg_torch.geometry import Camera, transform_points
-from femoreg_torch.pnp import FRONT_TO_BACK, MINIMUM, PnpResult, solve_pnp
+from femoreg_torch.pnp import FRONT_TO_BACK, MINIMUM, PnpResult, likely_pose, solve_pnp
 from femoreg_torch.registration.prepare import view_distortion
 from femoreg_torch.registration.scene import Outline, Scene, Segmentation
 from femoreg_torch.registration.silhouette import refine_by_silhouette
@@ -23,8 +23,8 @@ Detector = Callable[[Tensor, Camera], Detection]  # finds the landmarks in an at
 
 # Chosen on procedural patients 101 and 102, also where shutters leave less than half of the image.
 LEAST_OVERLAP = 0.90  # Dice of the outlined bones
-# Greatest standard deviation of the rotation, over all axes, of a start by landmarks alone. Outlines mend what is more
-# open (9° open: 2 to 3° off afterwards).
+# Greatest standard deviation of the rotation, over all axes, of a start by landmarks alone, or by few of them and
+# outlines. Outlines mend what is more open (9° open: 2 to 3° off afterwards).
 MOST_ROTATION_DEG = 5.0
 _MIRRORED = Display(mirrored=True)
 _SURE_OF_SIDES = 3.0  # log likelihood by which landmarks are to fit better than those of the other side
@@ -44,6 +44,7 @@ class Start:
     pnp: PnpResult
     used: list[str]  # names of the landmarks that PnP was given
     overlap: float | None  # of the outlined bones drawn and seen; None where they were not compared
+    few: bool = False  # landmarks: too few for a pose, which is that of the outlines
 
 
 def start_by_detection(case: Case, scene: Scene, detection: Detection) -> StartRecord:
@@ -125,10 +126,13 @@ def find_start(
     `field` (H, W), bool, is the exposed part of the image; None: all of it. `beam` is the axis of LPS that the beam
     runs along.
 
+    Fewer than four landmarks, or such as do not agree, tell with the outlines where to look for a pose. From those that
+    were seen in 17 views of another simulator, most of one hip alone, that gave 15 poses within 5° and 3 mm across
+    (depth within 35 mm), one 5 mm across (its CT was scaled), and one was refused.
+
     Raises `InputError` if the grey values are inverted, which would mislead the similarity even where the landmarks are
-    found, if fewer than four landmarks are of use or agree, if the bones drawn at the pose cover those that the
-    network sees by less than 90 % (Dice), or, without an outline, if the landmarks leave the rotation open by more than
-    5°.
+    found, if the bones drawn at the pose cover those that the network sees by less than 90 % (Dice), or, without an
+    outline, if fewer than four landmarks are of use or agree, or leave the rotation open by more than 5°.
     """
     if detection.inverted:
         raise InputError(
@@ -138,17 +142,24 @@ def find_start(
         )
     names = anatomy.landmark_names
     usable = [i for i, name in enumerate(names) if name in landmarks and bool(detection.visible[i])]
-    if len(usable) < MINIMUM:
-        raise InputError(
-            f"{len(usable)} usable landmarks found, at least {MINIMUM} are needed. Is this a {anatomy.name}, and is "
-            "`intensity` of the view right (raw: bone dark, log: bone bright)? Otherwise give the landmarks by hand "
-            "(--landmarks)."
-        )
-    points = torch.stack([landmarks[names[i]] for i in usable]).double()
-    spread = torch.tensor(anatomy.landmark_spread_mm, dtype=torch.float64)[usable]
-    seen = (detection.pixels[usable], camera, detection.confidence[usable], detection.deviation_px[usable])
-    pnp = solve_pnp(points, *seen, spread, beam)
     used = [names[i] for i in usable]
+    points = torch.stack([landmarks[name] for name in used]).double() if used else torch.zeros(0, 3).double()
+    spread = torch.tensor(anatomy.landmark_spread_mm, dtype=torch.float64)[usable]
+    pixels, deviations = detection.pixels[usable], detection.deviation_px[usable]
+    too_few: InputError | None = None
+    try:
+        if len(usable) < MINIMUM:
+            raise InputError(
+                f"{len(usable)} usable landmarks found, at least {MINIMUM} are needed. Is this a {anatomy.name}, and "
+                "is `intensity` of the view right (raw: bone dark, log: bone bright)? Otherwise give the landmarks by "
+                "hand (--landmarks)."
+            )
+        pnp = solve_pnp(points, pixels, camera, detection.confidence[usable], deviations, spread, beam)
+    except InputError as error:
+        if outline is None or not usable:
+            raise
+        too_few = error
+        pnp = likely_pose(points, pixels, camera, deviations, spread, beam)
     if outline is None:
         _check_rotation(pnp)
         return Start(pnp.camera_from_object, pnp, used, None)
@@ -157,13 +168,15 @@ def find_start(
     fit = refine_by_silhouette(
         outline, anatomy, pnp.camera_from_object, centre, pnp.covariance, bones, attenuation, camera, field
     )
+    if too_few is not None and (fit.overlap < LEAST_OVERLAP or fit.rotation_deviation_deg > MOST_ROTATION_DEG):
+        raise too_few
     if fit.overlap < LEAST_OVERLAP:
         raise InputError(
             f"{', '.join(outline.bones)} of the CT, drawn where the landmarks put them, and as the network sees them "
             f"agree by {fit.overlap:.0%} only (Dice; {LEAST_OVERLAP:.0%} are asked for). Is it the same patient? "
             "Otherwise take a view that shows more of them, or give the landmarks by hand (--landmarks)."
         )
-    return Start(fit.camera_from_ct, pnp, used, fit.overlap)
+    return Start(fit.camera_from_ct, pnp, used, fit.overlap, too_few is not None)
 
 
 def _check_rotation(pnp: PnpResult) -> None:
@@ -245,7 +258,8 @@ def _record(anchor: str, detection: Detection, start: Start, names: tuple[str, .
         )
         for i, name in enumerate(names)
     }
-    source = "landmarks of the network" + (", outlines" if start.overlap is not None else "")
+    source = ("few " if start.few else "") + "landmarks of the network"
+    source += ", outlines" if start.overlap is not None else ""
     return StartRecord(anchor, start.camera_from_ct, source, marks, start.pnp.rms_px, start.overlap)
 
 

@@ -114,6 +114,45 @@ def test_another_patient_is_refused(seen: Tensor) -> None:
         find_start(landmarks, blind, image, CAMERA, outline(2.0), HIP)
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_few_landmarks_and_outlines_tell_a_start(seen: Tensor, count: int) -> None:
+    """Which they do not without outlines, or where those do not agree."""
+    points = torch.randn(14, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 40
+    landmarks = dict(zip(HIP.landmark_names, points, strict=True))
+    few = replace(detection(seen, points), visible=torch.arange(14) < count)
+    image = torch.rand(CAMERA.shape)
+    found = find_start(landmarks, few, image, CAMERA, outline(2.0), HIP)
+    turned, apart = errors(found.camera_from_ct)
+    assert turned < 3
+    assert apart < 12
+    assert found.few
+    assert found.used == list(HIP.landmark_names[:count])
+    refused = f"{count} usable landmarks found, at least 4 are needed"
+    with pytest.raises(InputError, match=refused):
+        find_start(landmarks, few, image, CAMERA, None, HIP)
+    with pytest.raises(InputError, match=refused):
+        find_start(landmarks, few, image, CAMERA, outline(2.0, 0.7), HIP)
+    with pytest.raises(InputError, match="0 usable landmarks found"):
+        find_start(landmarks, replace(few, visible=few.visible & False), image, CAMERA, outline(2.0), HIP)
+
+
+def test_landmarks_that_contradict_each_other_leave_it_to_the_outlines(seen: Tensor) -> None:
+    points = torch.randn(14, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 40
+    landmarks = dict(zip(HIP.landmark_names, points, strict=True))
+    right = detection(seen, points)
+    astray = right.pixels + torch.tensor([[0.0, 0], [0, 0], [25, 0], [0, -30], *[[0, 0]] * 10]).double()
+    found = find_start(
+        landmarks,
+        replace(right, pixels=astray, visible=torch.arange(14) < 4),
+        torch.rand(CAMERA.shape),
+        CAMERA,
+        outline(2.0),
+        HIP,
+    )
+    assert found.few
+    assert errors(found.camera_from_ct)[0] < 3
+
+
 def test_one_half_of_a_pelvis_is_compared_by_itself(seen: Tensor) -> None:
     """The CT holds the left hip bone alone, while the image shows both."""
     half = outline_of(BoneLabels(labels(2.0), {"hip_left": 1}), HIP)
