@@ -21,7 +21,7 @@ def detect(
     Writes into OUT: landmarks.csv with the columns image, landmark, column_px, row_px, confidence, visible; and for
     each image a picture, and its visible landmarks as 3D Slicer markups (x = column, y = row, as for pixels of 1 mm).
     Patient left is expected on the right; an image that stands on its head, or has bone and background exchanged, is
-    noticed. So is one with fewer than four landmarks, which no start pose can be made of.
+    noticed. So is one with fewer than four landmarks, from which a start pose follows by the outlines of bones alone.
 
     Args:
         images: fluoroscopic images, or folders of nothing else: DICOM, PNG, TIFF, NIfTI, MHA or NRRD.
@@ -81,7 +81,11 @@ def detect(
         remarks = [
             *(["standing on its head"] if detection.turned else []),
             *(["grey values inverted"] if detection.inverted else []),
-            *([f"not enough landmarks for a start pose, which takes {MINIMUM}"] if count < MINIMUM else []),
+            *(
+                [f"fewer than {MINIMUM}: a start pose then hangs on the outlines of the bones"]
+                if count < MINIMUM
+                else []
+            ),
         ]
         console.print(", ".join([f"{path}: {count} of {len(detection.visible)} landmarks", *remarks]))
 

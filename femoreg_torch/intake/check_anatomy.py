@@ -77,9 +77,9 @@ def check_bones(
 
 def check_landmarks(seen: SeenAnatomy, found: Found) -> None:
     if seen.landmarks and len(seen.landmarks) < MINIMUM:
-        found.problem(
-            f"landmarks: {len(seen.landmarks)} of them, but the start pose takes at least {MINIMUM}. Place more of "
-            f"{', '.join(HIP.landmark_names)}."
+        found.warnings.append(
+            f"landmarks: {len(seen.landmarks)} of them; with fewer than {MINIMUM} the start pose hangs on the outlines "
+            f"of the bones. Place more of {', '.join(HIP.landmark_names)}."
         )
     outside = set()
     if seen.ct is not None:

@@ -151,7 +151,7 @@ def test_too_few_landmarks_are_said(
 ) -> None:
     detect([image], out=tmp_path / "out", weights=weights_of(50.0))
     said = " ".join(capsys.readouterr().out.split())
-    assert "0 of 14 landmarks, not enough landmarks for a start pose, which takes 4" in said
+    assert "0 of 14 landmarks, fewer than 4: a start pose then hangs on the outlines of the bones" in said
 
 
 def write_dicom(path: Path, raw: torch.Tensor) -> None:
