@@ -1,11 +1,11 @@
-"""Has the anatomy moved between the images without and with the device?
+"""Has the anatomy moved between the images without and with the device, or the device between the views?
 
-All images are registered as if the anatomy had stayed where it was and the C-arm had come back to where it was. The
-images tell whether that holds: let the anatomy, or one of its bones, move by a rigid motion y in the images of another
-kind than the first, in all views at once (the patient moved) or in one alone (the C-arm did not come back), and let
-everything else be refitted. With curvature and scores profiled as those of the intrinsics are
-(`registration.covariance`), the step of Newton is −S⁻¹ Σ r, and its covariance that of the sandwich estimator over
-tiles, S⁻¹ R S⁻¹.
+All images are registered as if the anatomy had stayed where it was, the C-arm had come back to where it was, and the
+device had been held still. The images tell whether that holds: let the anatomy, or one of its bones, move by a rigid
+motion y in the images of another kind than the first, in all views at once (the patient moved) or in one alone (the
+C-arm did not come back), or let the device move in one view, and let everything else be refitted. With curvature and
+scores profiled as those of the intrinsics are (`registration.covariance`), the step of Newton is −S⁻¹ Σ r, and its
+covariance that of the sandwich estimator over tiles, S⁻¹ R S⁻¹.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ Image = tuple[Kind, int]
 
 @dataclass(frozen=True, eq=False)
 class MotionBetween:
-    """How objects lie in some images of one kind, beside where they lie in the others."""
+    """How objects lie in some images of one kind, beside where they lie in all others."""
 
     kind: Kind
     views: tuple[int, ...]  # from 0, that it was looked for in, all at once
@@ -63,6 +63,24 @@ def motions_between(
             bodies = [names.index(name) for name in objects]
             chosen = [k == kind and view in where for k, view in images]
             found.append(MotionBetween(kind, where, objects, *_step(parts, chosen, _moves(bodies, centres))))
+    return tuple(found)
+
+
+def drifts_between_views(
+    scene: Scene, parts: Sequence[Quadratic], images: Sequence[Image], names: Sequence[str], centres: Tensor
+) -> tuple[MotionBetween, ...]:
+    """Motions in one view of each object that images of the first kind do not show, beside its other views.
+
+    `parts`, `images`, `names` and `centres` are as for `motions_between`.
+    """
+    found = []
+    for kind in dict.fromkeys(kind for kind, _ in images if kind != scene.first_kind):
+        views = tuple(view for k, view in images if k == kind)
+        for n, name in enumerate(names):
+            shown = scene.objects[name].shown_in
+            for view in views if kind in shown and scene.first_kind not in shown and len(views) > 1 else ():
+                chosen = [each == (kind, view) for each in images]
+                found.append(MotionBetween(kind, (view,), (name,), *_step(parts, chosen, _moves([n], centres))))
     return tuple(found)
 
 

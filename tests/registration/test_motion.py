@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from registration_scenes import make_scene, off, true_poses
+from registration_scenes import REFERENCE_POINTS, make_scene, off, true_poses
 
 from femoreg_torch.registration.covariance import pose_covariance
 from femoreg_torch.registration.doubts import doubts_about_motion
@@ -82,4 +82,33 @@ def test_all_views_together_need_less_certainty(views: tuple[int, ...], sigmas: 
     motion = torch.tensor([0.0, 0.0, 1.8, 0.0, 0.0, 0.4], dtype=torch.float64)
     found = MotionBetween("device", views, ("femur",), motion, motion.abs() / sigmas + 1e-9, 0.001)
     covariance = replace(pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(found,))
+    assert len(doubts_about_motion(covariance)) == told
+
+
+def test_a_device_that_moved_between_the_views_is_told() -> None:
+    """In view 2 by some millimetres across and degrees in the plane, on pixels of 3 mm."""
+    truth = true_poses()
+    still = make_scene(truth)
+    moved = off(truth.camera1_from["device"], REFERENCE_POINTS["device"], (0, 0, 2.0), (2.0, 1.2, 0))
+    elsewhere = make_scene(truth.with_object("device", moved), seed=1).images["device"]
+    images = (still.images["device"][0], elsewhere[1], still.images["device"][2])
+    held = replace(still, images=still.images | {"device": images})
+    for scene, told in ((still, 0), (held, 1)):
+        covariance = pose_covariance(scene, truth, _LEVEL, GradNcc(1))
+        assert [drift.views for drift in covariance.drifts] == [(0,), (1,), (2,)]
+        assert {drift.objects for drift in covariance.drifts} == {("device",)}
+        said = doubts_about_motion(covariance)
+        assert len(said) == told, said
+    assert "in the device image of view 2, the device lies elsewhere" in said[0]
+    best = max(covariance.drifts, key=lambda drift: drift.gain)
+    assert best.views == (1,)
+
+
+@pytest.mark.parametrize(("gain", "sigmas", "told"), [(0.0025, 1.1, 1), (0.0012, 3.5, 1), (0.0015, 2.2, 0)])
+def test_a_drift_is_told_by_what_it_gains_and_how_sure_it_is(gain: float, sigmas: float, told: int) -> None:
+    motion = torch.tensor([0.0, 0.0, 0.5, 0.9, 0.4, 0.0], dtype=torch.float64)
+    drift = MotionBetween("device", (1,), ("device",), motion, motion.abs() / sigmas + 1e-9, gain)
+    covariance = replace(
+        pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(), drifts=(drift,)
+    )
     assert len(doubts_about_motion(covariance)) == told
