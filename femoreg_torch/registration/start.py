@@ -156,7 +156,7 @@ def find_start(
             )
         pnp = solve_pnp(points, pixels, camera, detection.confidence[usable], deviations, spread, beam)
     except InputError as error:
-        if outline is None or not usable:
+        if outline is None or not usable or beam[1] == 0:  # the network does not know bones from a side
             raise
         too_few = error
         pnp = likely_pose(points, pixels, camera, deviations, spread, beam)

@@ -132,6 +132,8 @@ def test_few_landmarks_and_outlines_tell_a_start(seen: Tensor, count: int) -> No
         find_start(landmarks, few, image, CAMERA, None, HIP)
     with pytest.raises(InputError, match=refused):
         find_start(landmarks, few, image, CAMERA, outline(2.0, 0.7), HIP)
+    with pytest.raises(InputError, match=refused):
+        find_start(landmarks, few, image, CAMERA, outline(2.0), HIP, None, (1.0, 0.0, 0.0))
     with pytest.raises(InputError, match="0 usable landmarks found"):
         find_start(landmarks, replace(few, visible=few.visible & False), image, CAMERA, outline(2.0), HIP)
 
