@@ -164,7 +164,7 @@ def _assess_object(
     displacement = _displacement(scene, poses, name)
     reason = (
         _reason(name, views, limits)
-        or _unsettled(name, judged.pull, scene.anchor, limits)
+        or _unsettled(name, judged, limits)
         or _vague(name, judged.rotation, judged.translation, limits)
         or _loose(name, scene.anchor, covariance, limits)
         or _displaced(scene, name, displacement, limits)
@@ -191,18 +191,19 @@ class _Judged:
 
     rotation: Sequence[float]  # (3,) degrees, standard deviations by the images
     translation: Sequence[float]  # (3,) mm
-    pull: Tensor  # (6,) degrees and mm, of all images together; beside the anchor, if it is not the anchor itself
+    pull: Tensor  # (6,) degrees and mm, of all images together
+    beside: str | None  # the object that it is pulled beside; None for the anchor
 
     @classmethod
     def of(cls, covariance: PoseCovariance, poses: Poses, name: str, axis: Axis | None, anchor: str) -> "_Judged":
-        beside = name != anchor and anchor in covariance.bodies
-        pull = covariance.pull_beside(name, anchor) if beside else covariance.pull(name)
+        beside = anchor if name != anchor and anchor in covariance.bodies else None
+        pull = covariance.pull(name) if beside is None else covariance.pull_beside(name, beside)
         if axis is None:
-            return cls(*covariance.by_images(name), pull)
+            return cls(*covariance.by_images(name), pull, beside)
         i = 6 * covariance.bodies.index(name)
         rest = axis.without_turn(poses.camera1_from[name], covariance.centre(name))
         sigma = (rest @ covariance.images[i : i + 6, i : i + 6] @ rest.T).diagonal().clamp_min(0).sqrt().tolist()
-        return cls(sigma[:3], sigma[3:], rest @ pull)
+        return cls(sigma[:3], sigma[3:], rest @ pull, beside)
 
 
 def _displacement(scene: Scene, poses: Poses, name: str) -> tuple[float, float] | None:
@@ -224,15 +225,16 @@ def _displaced(scene: Scene, name: str, displacement: tuple[float, float] | None
     return f"the {name} lies {displacement[1]:.1f} mm from its place beside the {start.beside}"
 
 
-def _unsettled(name: str, pull: Tensor, anchor: str, limits: Limits) -> str | None:
+def _unsettled(name: str, judged: _Judged, limits: Limits) -> str | None:
     """A stage that held something in a wrong place leaves the images pulling; nan counts as that."""
+    pull = judged.pull
     turn, whole, across = (float(part.norm()) for part in (pull[:3], pull[3:], pull[3:5]))
-    if name == anchor:
+    if judged.beside is None:
         settled = across <= limits.most_common_pull_mm and whole <= limits.most_common_depth_pull_mm
         beside = ""
     else:
         settled = whole <= limits.most_common_pull_mm
-        beside = f" beside the {anchor}"
+        beside = f" beside the {judged.beside}"
     if turn <= limits.most_common_pull_deg and settled:
         return None
     return f"all images together would move the {name} by {turn:.1f}° and {whole:.1f} mm{beside}, were all else free"

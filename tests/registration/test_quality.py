@@ -1,13 +1,15 @@
 """Trust: given at the truth, withheld where a pose is wrong or an object cannot be seen."""
 
+import math
 from dataclasses import replace
 
 import pytest
+import torch
 from registration_scenes import REFERENCE_POINTS, float64, make_scene, off, true_poses
 
 from femoreg_torch.case import Start
 from femoreg_torch.case.trace import Restart, StageRecord
-from femoreg_torch.registration.quality import Limits, assess
+from femoreg_torch.registration.quality import Limits, _Judged, _unsettled, assess
 from femoreg_torch.registration.scene import Scene
 
 TRUTH = true_poses()
@@ -86,3 +88,25 @@ def test_a_rival_that_fits_as_well_is_a_doubt(scene: Scene, cost: float, apart_d
     assert found["pelvis"].trusted
     assert found["femur"].trusted is trusted
     assert trusted or "femur in view 1" in found["femur"].reason
+
+
+@pytest.mark.parametrize(
+    ("beside", "pull", "settled"),
+    [
+        (None, (0, 0, 0, 0.2, 0, 1.9), True),  # in depth, which matters least
+        (None, (0, 0, 0, 0, 0, 2.1), False),
+        (None, (0, 0, 0, 0.9, 0.6, 0), False),  # across
+        (None, (0.8, 0.7, 0, 0, 0, 0), False),
+        ("pelvis", (0.5, 0, 0, 0.3, 0, 0.9), True),
+        ("pelvis", (0, 0, 0, 0, 0, 1.1), False),
+        ("pelvis", (0, 1.1, 0, 0, 0, 0), False),
+        ("pelvis", (0, 0, 0, math.nan, 0, 0), False),
+    ],
+)
+def test_a_pull_is_asked_beside_the_anchor_and_of_the_anchor_mostly_across(
+    beside: str | None, pull: tuple[float, ...], settled: bool
+) -> None:
+    judged = _Judged([0.0] * 3, [0.0] * 3, torch.tensor(pull, dtype=torch.float64), beside)
+    told = _unsettled("femur", judged, Limits())
+    assert (told is None) is settled
+    assert told is None or ("beside the pelvis" in told) is (beside is not None)
