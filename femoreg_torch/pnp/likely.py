@@ -32,11 +32,12 @@ def likely_pose(
     deviations_px: Tensor,
     point_deviations_mm: Tensor,
     beam: tuple[float, float, float],
+    turned: bool = False,
 ) -> PnpResult:
     """The most probable pose of points (N, 3), LPS mm, seen at pixels (N, 2); N is at least one.
 
     `deviations_px` (N,), `point_deviations_mm` (N,) and `beam` are as for `solve_pnp`. The image is as the source sees
-    it, the patient's head up.
+    it, the patient's head up, or down where it is `turned`.
     """
     seen, matrix = pixels.double().numpy(), camera.matrix().numpy()
     magnified = point_deviations_mm.double().numpy() / _DEPTH / camera.mean_pixel_mm
@@ -44,7 +45,7 @@ def likely_pose(
     middle = points.double().numpy().mean(0)
     arms = points.double().numpy() - middle
     along = np.asarray(beam, dtype=np.float64)
-    down = np.array([0.0, 0.0, -1.0])
+    down = np.array([0.0, 0.0, 1.0 if turned else -1.0])
     nominal = np.stack([np.cross(down, along), down, along])
     depth = _DEPTH * camera.sdd_mm
     ray = np.linalg.solve(matrix, np.append(seen.mean(0), 1.0))

@@ -159,7 +159,7 @@ def find_start(
         if outline is None or not usable or beam[1] == 0:  # the network does not know bones from a side
             raise
         too_few = error
-        pnp = likely_pose(points, pixels, camera, deviations, spread, beam)
+        pnp = likely_pose(points, pixels, camera, deviations, spread, beam, detection.turned)
     if outline is None:
         _check_rotation(pnp)
         return Start(pnp.camera_from_object, pnp, used, None)

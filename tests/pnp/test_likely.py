@@ -68,3 +68,15 @@ def test_a_patient_on_the_side_is_looked_for_along_its_own_beam() -> None:
     pose = likely_pose(marks, pixels, CAMERA, sigma, 0 * sigma, (-1.0, 0.0, 0.0)).camera_from_object
     assert pose_difference(turned @ side, pose, marks.mean(0))[0] < 15
     assert pose[2, 0] < -0.9
+
+
+def test_an_image_that_stands_on_its_head_is_looked_at_so() -> None:
+    head_down = rigid(exp_so3(torch.tensor([0.0, 0.0, math.pi]).double()), torch.zeros(3).double())
+    truth, marks = (
+        about_point(head_down, torch.tensor([20.0, 10.0, 690.0]).double()) @ posed((3, 4, 5), (20, 10, 690)),
+        points(2),
+    )
+    pixels = project_points(CAMERA, transform_points(truth, marks))
+    sigma = torch.ones(2).double()
+    pose = likely_pose(marks, pixels, CAMERA, sigma, 0 * sigma, BEAM, turned=True).camera_from_object
+    assert pose_difference(truth, pose, marks.mean(0))[0] < 15
