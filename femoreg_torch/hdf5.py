@@ -156,7 +156,7 @@ def _limit_memory() -> None:
     """Beside what the parent has, which the child shares."""
     sizes = Path("/proc/self/statm")
     if sizes.exists():  # Linux
-        pages = int(sizes.read_text().split()[0]) + int(_SHARE_OF_MEMORY * os.sysconf("SC_PHYS_PAGES"))
+        pages = int(sizes.read_text(encoding="utf-8").split()[0]) + int(_SHARE_OF_MEMORY * os.sysconf("SC_PHYS_PAGES"))
         _limit(resource.RLIMIT_AS, pages * os.sysconf("SC_PAGE_SIZE"))
 
 

@@ -47,9 +47,7 @@ from femoreg_torch.volume.borders import cut_bones
 _ANY_PATH = PlannedPath(FEMUR, torch.zeros(3).double(), torch.ones(3).double())
 _ANY_POINTS = {name: n * torch.ones(3).double() for n, name in enumerate(DEVICE_POINTS)}
 _FAR_MM = 150.0  # from the middle of a device, beyond its own size, no point of it lies
-_BEYOND_MM = (
-    25.0  # outside the box of its model: a drill may stand out of a sleeve, or the file has other units or axes
-)
+_BEYOND_MM = 25.0  # outside the box of its model: a drill may stand out of a sleeve; or units and axes are others
 _GUIDE_MM = (20.0, 600.0)  # from base to tip; a model in metres, inches or µm is likely beyond
 _FAR_FROM_BONE_MM = 400.0  # a device that starts farther from the entry point is likely told wrong
 

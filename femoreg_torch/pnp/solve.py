@@ -201,7 +201,7 @@ def _distances(camera_from_object: Tensor, points: Tensor, pixels: Tensor, camer
 
 
 @dataclass(frozen=True)
-class _Movable:
+class Movable:
     """Points about a pose that is turned about their centroid and shifted by a twist (rotation vector, translation)."""
 
     arms: Array  # (N, 3) from the centroid, camera axes
@@ -223,10 +223,18 @@ class _Movable:
         return torch.from_numpy(pose)
 
 
-def _movable(camera_from_object: Array, points: Array, camera: Camera) -> _Movable:
+def movable(camera_from_object: Array, points: Array, camera: Camera) -> Movable:
+    """Points (N, 3) of an object at a pose (4, 4), to be turned about their own centre."""
     in_camera = points @ camera_from_object[:3, :3].T + camera_from_object[:3, 3]
     centre = in_camera.mean(0)
-    return _Movable(in_camera - centre, centre, camera.matrix().numpy())
+    return Movable(in_camera - centre, centre, camera.matrix().numpy())
+
+
+def by_huber(offset: Array) -> Array:
+    """Residuals (N, 2), in standard deviations, so that their squares are Huber's loss of offsets (N, 2)."""
+    length = np.linalg.norm(offset, axis=1, keepdims=True).clip(1e-12)
+    linear = np.sqrt(np.maximum(2 * _HUBER_DEVIATIONS * length - _HUBER_DEVIATIONS**2, 0)) / length
+    return np.asarray(np.where(length < _HUBER_DEVIATIONS, 1, linear) * offset)
 
 
 def _refine(
@@ -234,18 +242,18 @@ def _refine(
 ) -> tuple[Tensor, Tensor]:
     """The pose of least Huber loss near `camera_from_object`, and its covariance (6, 6)."""
     start = camera_from_object.numpy()
-    movable = _movable(start, points.double().numpy(), camera)
+    moving = movable(start, points.double().numpy(), camera)
     seen, pixel_mm = pixels.double().numpy(), float(np.mean(camera.pixel_mm))
     root = np.sqrt(weights / weights.mean())[:, None]
 
     def residuals_mm(twist: Array) -> Array:
-        return np.asarray((root * (movable.pixels(twist) - seen) * pixel_mm).ravel())
+        return np.asarray((root * (moving.pixels(twist) - seen) * pixel_mm).ravel())
 
     solution = least_squares(residuals_mm, np.zeros(6), loss="huber", f_scale=_HUBER_MM, x_scale=_STEPS)
     freedom = max(1, len(solution.fun) - 6)
     variance = max(_FLOOR_MM**2, float((solution.fun**2).sum()) / freedom)
     normal = solution.jac.T @ solution.jac
-    return movable.pose(solution.x, start), torch.from_numpy(variance * np.linalg.pinv(normal))
+    return moving.pose(solution.x, start), torch.from_numpy(variance * np.linalg.pinv(normal))
 
 
 def _most_probable(
@@ -257,16 +265,14 @@ def _most_probable(
     patient is the third row of the rotation; its parts across the axis `beam` are the prior's residuals.
     """
     start = camera_from_object.numpy()
-    movable = _movable(start, points, camera)
+    moving = movable(start, points, camera)
     tilt = np.sin(np.radians(_TILT_DEG))
 
     def residuals(twist: Array) -> Array:
-        offset = (movable.pixels(twist) - pixels) / deviations_px[:, None]
-        length = np.linalg.norm(offset, axis=1, keepdims=True).clip(1e-12)
-        linear = np.sqrt(np.maximum(2 * _HUBER_DEVIATIONS * length - _HUBER_DEVIATIONS**2, 0)) / length
+        offset = (moving.pixels(twist) - pixels) / deviations_px[:, None]
         direction = (cv2.Rodrigues(twist[:3])[0] @ start[:3, :3])[2]
         across = direction[beam == 0] / tilt
-        return np.append((np.where(length < _HUBER_DEVIATIONS, 1, linear) * offset).ravel(), across)
+        return np.append(by_huber(offset).ravel(), across)
 
     solution = least_squares(residuals, np.zeros(6), x_scale=_STEPS)
-    return movable.pose(solution.x, start), torch.from_numpy(np.linalg.pinv(solution.jac.T @ solution.jac))
+    return moving.pose(solution.x, start), torch.from_numpy(np.linalg.pinv(solution.jac.T @ solution.jac))

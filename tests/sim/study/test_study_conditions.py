@@ -25,8 +25,8 @@ from sim.study.work import settings_of
 from sim.study.yardsticks import only_these
 from sim.theatre.case_folders import write_simulation
 from sim.theatre.metal import draw_materials
-from sim.theatre.preoperative_case import read_preoperative
-from sim.theatre.procedure import draw_procedure
+from sim.theatre.preoperative_case import Preoperative, read_preoperative
+from sim.theatre.procedure import Procedure, draw_procedure
 from sim.theatre.settings import load_simulation
 
 CONDITIONS = load_protocol("conditions").vary
@@ -155,15 +155,20 @@ def test_the_focal_length_is_told_wrong_and_nothing_else(imaged: Imaged) -> None
         assert torch.equal(shown(imaged, name), shown(imaged, "uniform"))
 
 
-def test_the_patient_moves_by_just_so_much_between_the_images(stores: Stores, tmp_path: Path) -> None:
+def still_and_moved(stores: Stores, folder: Path, **moves: float) -> tuple[Preoperative, Procedure, Procedure]:
+    """A procedure of one seed, as it is and with something moving."""
     paper = load_simulation("paper")
-    known = read_preoperative(stores.patients / "somebody" / "1.0", "right", 2, paper, tmp_path / "device.stl")
+    known = read_preoperative(stores.patients / "somebody" / "1.0", "right", 2, paper, folder / "device.stl")
     mesh = read_mesh(known.device.model.path)
-    moving = replace(paper.acquisition, moved_deg=1.0, moved_mm=2.0)
     still, moved = (
         draw_procedure(known, mesh, settings, torch.Generator().manual_seed(5))
-        for settings in (paper.acquisition, moving)
+        for settings in (paper.acquisition, replace(paper.acquisition, **moves))
     )
+    return known, still, moved
+
+
+def test_the_patient_moves_by_just_so_much_between_the_images(stores: Stores, tmp_path: Path) -> None:
+    known, still, moved = still_and_moved(stores, tmp_path, moved_deg=1.0, moved_mm=2.0)
     assert still.lps_moved is None
     assert moved.lps_moved is not None
     assert torch.rad2deg(rotation_angle(moved.lps_moved[:3, :3])).item() == pytest.approx(1)
@@ -175,14 +180,7 @@ def test_the_patient_moves_by_just_so_much_between_the_images(stores: Stores, tm
 def test_a_device_held_by_hand_moves_by_just_so_much_in_each_view_after_the_first(
     stores: Stores, tmp_path: Path
 ) -> None:
-    paper = load_simulation("paper")
-    known = read_preoperative(stores.patients / "somebody" / "1.0", "right", 2, paper, tmp_path / "device.stl")
-    mesh = read_mesh(known.device.model.path)
-    held = replace(paper.acquisition, device_moved_deg=1.0, device_moved_mm=2.0)
-    still, moved = (
-        draw_procedure(known, mesh, settings, torch.Generator().manual_seed(5))
-        for settings in (paper.acquisition, held)
-    )
+    known, still, moved = still_and_moved(stores, tmp_path, device_moved_deg=1.0, device_moved_mm=2.0)
     apart = [
         pose_difference(*views, known.device.points["center"])
         for views in zip(still.camera_from_device, moved.camera_from_device, strict=True)
