@@ -15,9 +15,10 @@ setup: .venv/.installed
 demo: setup
 	$(BIN)/femoreg demo --out out/demo
 
-# several processes, each with its share of the cores; the tests of one file run in one of them
+# several processes, each with its share of the cores; the tests of one file run in one of them;
+# in the plainest locale, which shows where a file's encoding was left open
 test: setup
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+	LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0 $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 # ten thousand broken files at all doors, from a new seed; FEMOREG_FUZZ_SEED=… repeats one
 fuzz: setup

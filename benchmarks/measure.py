@@ -53,7 +53,9 @@ def resident_mib(device: str) -> float:
         torch.cuda.synchronize()
         torch.cuda.reset_peak_memory_stats()
         return torch.cuda.memory_allocated() / 2**20
-    Path("/proc/self/clear_refs").write_text("5")  # Linux: sets VmHWM back to VmRSS (proc_pid_clear_refs(5))
+    Path("/proc/self/clear_refs").write_text(
+        "5", encoding="utf-8"
+    )  # Linux: sets VmHWM back to VmRSS (proc_pid_clear_refs(5))
     return _status_mib("VmRSS")
 
 
@@ -65,7 +67,7 @@ def _peak_mib(device: str) -> float:
 
 
 def _status_mib(field: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(field)) / 1024
 
 
@@ -86,7 +88,9 @@ def missing(package: str) -> str | None:
 
 def machine(device: str, packages: Sequence[str]) -> str:
     """One line: processor, cores, load, versions."""
-    names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+    names = [
+        line for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines() if line.startswith("model name")
+    ]
     model = names[0].split(":")[1].strip() if names else platform.processor()
     graphics = f", {torch.cuda.get_device_name()}" if device == "cuda" else ""
     found = ", ".join(f"{p} {version(p)}" for p in ("torch", "numba", *packages))

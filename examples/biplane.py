@@ -62,7 +62,7 @@ def write_case(folder: Path) -> femoreg.Poses:
     content["views"][1]["camera_from_camera1"] = oblique.tolist()
     for view, name in enumerate(("frontal.tif", "oblique.tif")):
         write_image(folder / name, photograph(patient, truth, view, camera))
-    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return truth
 
 

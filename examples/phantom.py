@@ -45,7 +45,7 @@ def write_models(folder: Path) -> None:
 def write_case(folder: Path) -> femoreg.Poses:
     """Models, images and `case.yaml`; returns the true poses."""
     write_models(folder)
-    (folder / "carm.yaml").write_text(CARM)
+    (folder / "carm.yaml").write_text(CARM, encoding="utf-8")
     carm = femoreg.load_carm(folder / "carm.yaml")
     block = rigid(exp_so3(float64(0.4, 0.6, -0.2)), float64(-25, -10, 680))
     rod = rigid(exp_so3(float64(-0.3, 0.9, 0.4)), float64(40, 10, 640))
@@ -83,7 +83,7 @@ def write_case(folder: Path) -> femoreg.Poses:
         primary = (-femoreg.project(solids, poses, carm.camera, step_mm=0.3)[0]).exp()
         counts = torch.poisson(30_000 * (primary + SCATTER), generator=torch.Generator().manual_seed(view))
         write_image(folder / f"view{view + 1}.tif", counts.clamp(1, 65535).to(torch.uint16))
-    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return truth
 
 
@@ -91,7 +91,7 @@ def main(folder: Path) -> dict[str, Any]:
     """Make the case, register it, and return how far the objects are off."""
     truth = write_case(folder)
     case = femoreg.read_case(folder)
-    (folder / "preset.yaml").write_text(PRESET)
+    (folder / "preset.yaml").write_text(PRESET, encoding="utf-8")
     result = femoreg.register(case, folder / "preset.yaml")
     print(result.verdict.sentence)
     errors = {}

@@ -160,14 +160,16 @@ def test_a_picture_cut_off_prints_nothing(tmp_path: Path, capfd: pytest.CaptureF
 
 
 def test_a_mesh_with_a_corner_far_away(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
-    (tmp_path / "a.off").write_text("OFF\n4 4 0\n0 0 0\n9 0 0\n0 9 0\n0 0 1e300\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n")
+    (tmp_path / "a.off").write_text(
+        "OFF\n4 4 0\n0 0 0\n9 0 0\n0 9 0\n0 0 1e300\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n", encoding="utf-8"
+    )
     with pytest.raises(InputError, match=r"a\.off: a corner lies 1e\+300 mm"):
         read_mesh(tmp_path / "a.off")
     assert len(recwarn) == 0
 
 
 def test_a_mesh_with_a_corner_that_is_not_there(tmp_path: Path) -> None:
-    (tmp_path / "a.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n")
+    (tmp_path / "a.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"a\.off"):
         read_mesh(tmp_path / "a.off")
     (tmp_path / "a.pickle").write_bytes(b"x")

@@ -87,11 +87,11 @@ steps:
 @pytest.fixture
 def installed(tmp_path: Path) -> Iterator[Path]:
     """A folder on the path with a package installed in it: a module, and the metadata that names its entry points."""
-    (tmp_path / "mine_of_a_test.py").write_text(MODULE)
+    (tmp_path / "mine_of_a_test.py").write_text(MODULE, encoding="utf-8")
     metadata = tmp_path / "mine-1.0.dist-info"
     metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
-    (metadata / "entry_points.txt").write_text(ENTRY_POINTS)
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n", encoding="utf-8")
+    (metadata / "entry_points.txt").write_text(ENTRY_POINTS, encoding="utf-8")
     sys.path.insert(0, str(tmp_path))
     importlib.invalidate_caches()
     yield tmp_path
@@ -143,7 +143,7 @@ def test_objects_of_one_s_own_make_a_stage(optimiser, scene: tuple[Scene, Tensor
 
 
 def test_a_preset_names_what_another_package_registers(installed: Path, scene: tuple[Scene, Tensor]) -> None:
-    (installed / "mine.yaml").write_text(PRESET)
+    (installed / "mine.yaml").write_text(PRESET, encoding="utf-8")
     plan = load_plan(installed / "mine.yaml")
     found = run_plan(scene[0], plan, None, seed=0)
     torch.testing.assert_close(found.poses.camera1_from["ball"], scene[1], atol=2.1, rtol=0)  # a grid of 2 mm
@@ -166,12 +166,12 @@ def test_a_preset_names_what_another_package_registers(installed: Path, scene: t
     ],
 )
 def test_mistakes_are_told(installed: Path, old: str, new: str, says: str) -> None:
-    (installed / "mine.yaml").write_text(PRESET.replace(old, new))
+    (installed / "mine.yaml").write_text(PRESET.replace(old, new), encoding="utf-8")
     with pytest.raises(InputError, match=f"mine.yaml, step 2, .*{says}"):
         load_plan(installed / "mine.yaml")
 
 
 def test_without_that_package_its_kinds_are_unknown(tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text(PRESET)
+    (tmp_path / "mine.yaml").write_text(PRESET, encoding="utf-8")
     with pytest.raises(InputError, match=r"step 1: unknown kind 'nothing'. Known kinds: stage, orbit_search"):
         load_plan(tmp_path / "mine.yaml")

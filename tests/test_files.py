@@ -35,7 +35,7 @@ def names(folder: Path) -> list[str]:
 
 def test_a_new_folder_appears_only_when_complete(tmp_path: Path) -> None:
     with new_folder(tmp_path / "a" / "run") as built:
-        (built / "result.json").write_text("{}")
+        (built / "result.json").write_text("{}", encoding="utf-8")
         assert not (tmp_path / "a" / "run").exists()
     assert names(tmp_path / "a") == ["run"]
     assert names(tmp_path / "a" / "run") == ["result.json"]
@@ -43,7 +43,7 @@ def test_a_new_folder_appears_only_when_complete(tmp_path: Path) -> None:
 
 def fail_while_building(folder: Path) -> None:
     with new_folder(folder) as built:
-        (built / "result.json").write_text("half")
+        (built / "result.json").write_text("half", encoding="utf-8")
         raise RuntimeError
 
 
@@ -52,11 +52,11 @@ def test_a_failed_build_leaves_nothing(tmp_path: Path) -> None:
         fail_while_building(tmp_path / "run")
     assert names(tmp_path) == []
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "result.json").write_text("old")
+    (tmp_path / "run" / "result.json").write_text("old", encoding="utf-8")
     with pytest.raises(RuntimeError):
         fail_while_building(tmp_path / "run")
     assert names(tmp_path) == ["run"]
-    assert (tmp_path / "run" / "result.json").read_text() == "old"
+    assert (tmp_path / "run" / "result.json").read_text(encoding="utf-8") == "old"
 
 
 def test_a_full_disk_is_told_with_the_name(tmp_path: Path) -> None:
@@ -97,16 +97,16 @@ def test_what_a_file_left_behind_in_a_new_folder_does_not_come_along(
 def test_only_what_was_built_is_replaced(tmp_path: Path) -> None:
     run = tmp_path / "run"
     (run / "pictures").mkdir(parents=True)
-    (run / "pictures" / "old.png").write_text("old")
-    (run / "result.json").write_text("old")
-    (run / "notes.txt").write_text("mine")
+    (run / "pictures" / "old.png").write_text("old", encoding="utf-8")
+    (run / "result.json").write_text("old", encoding="utf-8")
+    (run / "notes.txt").write_text("mine", encoding="utf-8")
     with new_folder(run) as built:
-        (built / "result.json").write_text("new")
+        (built / "result.json").write_text("new", encoding="utf-8")
         (built / "pictures").mkdir()
-        (built / "pictures" / "new.png").write_text("new")
+        (built / "pictures" / "new.png").write_text("new", encoding="utf-8")
     assert names(run) == ["notes.txt", "pictures", "result.json"]
-    assert (run / "notes.txt").read_text() == "mine"
-    assert (run / "result.json").read_text() == "new"
+    assert (run / "notes.txt").read_text(encoding="utf-8") == "mine"
+    assert (run / "result.json").read_text(encoding="utf-8") == "new"
     assert names(run / "pictures") == ["new.png"]
     assert names(tmp_path) == ["run"]
 
@@ -127,12 +127,12 @@ def test_what_is_kept_is_linked_and_looks_as_before(tmp_path: Path, way: str) ->
     (run / "deep" / "to the large one").symlink_to("er/ct.nii.gz")
     (run / "elsewhere").symlink_to(tmp_path / "no such file")
     (run / "a folder").symlink_to("deep")
-    (run / "report.html").write_text("of the old result")
+    (run / "report.html").write_text("of the old result", encoding="utf-8")
     run.chmod(0o750)
     inode = large.stat().st_ino
     with new_folder(run, without=["report.html", "not there"]) as built:
-        (built / "result.json").write_text("new")
-        (built / "elsewhere").write_text("a file now")
+        (built / "result.json").write_text("new", encoding="utf-8")
+        (built / "elsewhere").write_text("a file now", encoding="utf-8")
     assert names(run) == ["a folder", "deep", "elsewhere", "result.json"]
     assert large.stat().st_ino == inode
     assert (run / "deep" / "to the large one").readlink() == Path("er/ct.nii.gz")
@@ -147,12 +147,12 @@ def test_where_there_are_no_links_files_are_copied(tmp_path: Path, monkeypatch: 
         raise OSError(1, "Operation not permitted")
 
     (tmp_path / "run" / "deep").mkdir(parents=True)
-    (tmp_path / "run" / "deep" / "ct.nii.gz").write_text("a CT")
+    (tmp_path / "run" / "deep" / "ct.nii.gz").write_text("a CT", encoding="utf-8")
     (tmp_path / "run" / "link").symlink_to("deep")
     monkeypatch.setattr(os, "link", no_link)
     with new_folder(tmp_path / "run") as built:
-        (built / "result.json").write_text("new")
-    assert (tmp_path / "run" / "deep" / "ct.nii.gz").read_text() == "a CT"
+        (built / "result.json").write_text("new", encoding="utf-8")
+    assert (tmp_path / "run" / "deep" / "ct.nii.gz").read_text(encoding="utf-8") == "a CT"
     assert (tmp_path / "run" / "link").readlink() == Path("deep")
 
 
@@ -164,8 +164,8 @@ def test_a_folder_by_another_name_is_replaced_where_it_is(
     monkeypatch.chdir(tmp_path / "real" / "run")
     for number, path in enumerate((Path(), Path("no/.."), tmp_path / "link")):
         with new_folder(path) as built:
-            (built / f"{number}.txt").write_text("new")
-        assert Path(f"{number}.txt").read_text() == "new"  # a relative path means the new folder
+            (built / f"{number}.txt").write_text("new", encoding="utf-8")
+        assert Path(f"{number}.txt").read_text(encoding="utf-8") == "new"  # a relative path means the new folder
     assert (tmp_path / "link").is_symlink()
     assert names(tmp_path / "real" / "run") == ["0.txt", "1.txt", "2.txt"]
     assert names(tmp_path / "real") == ["run"]
@@ -262,47 +262,49 @@ def test_killed_at_any_moment_a_writer_leaves_files_that_agree(tmp_path: Path, w
             time.sleep(moments.uniform(0, 0.02))
             writer.kill()
         with new_folder(run) as built:  # brings an old folder back that was renamed away
-            (built / "notes.txt").write_text("mine")
-        assert (run / "result.json").read_text() == (run / "deep" / "navigation.json").read_text()
+            (built / "notes.txt").write_text("mine", encoding="utf-8")
+        assert (run / "result.json").read_text(encoding="utf-8") == (run / "deep" / "navigation.json").read_text(
+            encoding="utf-8"
+        )
         assert names(tmp_path) == ["run"]
 
 
 def test_a_folder_is_cleared_of_what_killed_writers_left_of_anything_in_it(tmp_path: Path) -> None:
     (tmp_path / ".gone.abcd1234.part" / "old").mkdir(parents=True)
-    (tmp_path / ".gone.abcd1234.part" / "old" / "result.json").write_text("{}")
+    (tmp_path / ".gone.abcd1234.part" / "old" / "result.json").write_text("{}", encoding="utf-8")
     (tmp_path / ".kept.abcd1234.part" / "old").mkdir(parents=True)
     (tmp_path / "kept").mkdir()
     (tmp_path / ".notes.part").mkdir()
     with new_folder(tmp_path / "live") as built:
         clear_leftovers(tmp_path)
-        (built / "result.json").write_text("{}")
+        (built / "result.json").write_text("{}", encoding="utf-8")
     assert names(tmp_path) == [".notes.part", "gone", "kept", "live"]
     assert names(tmp_path / "gone") == names(tmp_path / "live") == ["result.json"]
 
 
 def test_what_a_live_writer_builds_is_not_taken_for_a_leftover(tmp_path: Path) -> None:
     with new_folder(tmp_path / "run") as first, temporary_file(tmp_path / "run.json") as file:
-        (first / "a.txt").write_text("first")
-        file.write_text("{}")
+        (first / "a.txt").write_text("first", encoding="utf-8")
+        file.write_text("{}", encoding="utf-8")
         with new_folder(tmp_path / "run") as second, temporary_file(tmp_path / "run.json") as again:
-            (second / "b.txt").write_text("second")
-            again.write_text("[]")
+            (second / "b.txt").write_text("second", encoding="utf-8")
+            again.write_text("[]", encoding="utf-8")
     assert names(tmp_path / "run") == ["a.txt", "b.txt"]
-    assert (tmp_path / "run.json").read_text() == "{}"
+    assert (tmp_path / "run.json").read_text(encoding="utf-8") == "{}"
     assert names(tmp_path) == ["run", "run.json"]
 
 
 @pytest.mark.parametrize("name", ["lock", "new", "old"])
 def test_no_name_is_special(tmp_path: Path, name: str) -> None:
     write_text(tmp_path / name, "text")
-    assert (tmp_path / name).read_text() == "text"
+    assert (tmp_path / name).read_text(encoding="utf-8") == "text"
     with new_folder(tmp_path / "run") as built:
         write_text(built / name, "text")
     assert names(tmp_path / "run") == [name]
 
 
 def test_a_file_in_the_place_of_a_folder(tmp_path: Path) -> None:
-    (tmp_path / "run").write_text("a file")
+    (tmp_path / "run").write_text("a file", encoding="utf-8")
     with pytest.raises(InputError, match="is a file, a folder was expected"), new_folder(tmp_path / "run"):
         pass
 
@@ -313,7 +315,7 @@ def test_a_file_in_a_folder_that_is_not_there(tmp_path: Path) -> None:
 
 
 def contents(folder: Path) -> dict[str, str]:
-    return {path.name: path.read_text() for path in sorted(folder.iterdir())}
+    return {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
 
 
 @pytest.mark.parametrize("old", [{}, {"a": "old", "b": "old", "c": "old"}, {"b": "old"}])
@@ -324,12 +326,12 @@ def test_files_that_belong_together_are_all_old_or_all_new_whichever_step_fails(
         for path in tmp_path.iterdir():
             path.unlink()
         for name, text in old.items():
-            (tmp_path / name).write_text(text)
+            (tmp_path / name).write_text(text, encoding="utf-8")
         with fault(tmp_path, n):
             try:
                 with temporary_files(*(tmp_path / name for name in "abc")) as parts:
                     for part in parts:
-                        part.write_text("new")
+                        part.write_text("new", encoding="utf-8")
                 found = dict.fromkeys("abc", "new")
             except OSError:
                 found = old
@@ -375,7 +377,7 @@ def test_json_is_readable_and_exact_to_nine_decimals(tmp_path: Path) -> None:
         "deep": [{"p": [1, 2.5]}],
     }
     write_json(tmp_path / "a.json", content)
-    text = (tmp_path / "a.json").read_text()
+    text = (tmp_path / "a.json").read_text(encoding="utf-8")
     assert "  [0.333333333, 0.0, 0.0, 0.0],\n" in text  # one row of a matrix, one line
     assert "-0.0" not in text
     again = read_json(tmp_path / "a.json")
@@ -388,7 +390,7 @@ def test_json_is_readable_and_exact_to_nine_decimals(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["loop", "file", "below a file", "long", "null", "a long name", "deep"])
 def test_where_no_folder_can_be_is_told_before_anything_is_computed(tmp_path: Path, kind: str) -> None:
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    (tmp_path / "file").write_text("mine")
+    (tmp_path / "file").write_text("mine", encoding="utf-8")
     path = {
         "below a file": tmp_path / "file" / "run",
         "long": tmp_path / ("x" * 5000),

@@ -118,10 +118,12 @@ def test_every_package_is_installed() -> None:
 @pytest.fixture
 def foreign_folder(tmp_path: Path) -> Path:
     """A folder in which `models`, `sim`, `training` and `configs` are somebody else's."""
-    (tmp_path / "models.py").write_text("raise RuntimeError('the models of somebody else')\n")
+    (tmp_path / "models.py").write_text("raise RuntimeError('the models of somebody else')\n", encoding="utf-8")
     for name in ("sim", "training", "configs"):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "__init__.py").write_text(f"raise RuntimeError('the {name} of somebody else')\n")
+        (tmp_path / name / "__init__.py").write_text(
+            f"raise RuntimeError('the {name} of somebody else')\n", encoding="utf-8"
+        )
     return tmp_path
 
 

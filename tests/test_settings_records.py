@@ -85,7 +85,7 @@ def test_what_does_not_fit_is_one_line(content: Any, message: str) -> None:
 def test_no_module_is_imported_that_a_file_names(
     content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "evil_module.py").write_text("class Inner:\n    pass\n")
+    (tmp_path / "evil_module.py").write_text("class Inner:\n    pass\n", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(InputError, match=r"a mapping|unknown key"):
         read_record(Outer, content, "a.yaml")

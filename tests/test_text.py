@@ -99,7 +99,7 @@ def test_json_alike(text: str | bytes, message: str, tmp_path: Path) -> None:
 
 
 def test_slicer_may_write_nan_where_a_point_was_not_placed(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text('{"a": NaN}')
+    (tmp_path / "a.json").write_text('{"a": NaN}', encoding="utf-8")
     assert str(read_json(tmp_path / "a.json", with_nan=True)) == "{'a': nan}"
 
 
@@ -107,7 +107,7 @@ def test_tables_are_text(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="cannot be read as CSV"):
         read_csv(tmp_path / "a.csv", ("a",))
-    (tmp_path / "b.csv").write_text("a,b\n" + "x" * 200_000)
+    (tmp_path / "b.csv").write_text("a,b\n" + "x" * 200_000, encoding="utf-8")
     with pytest.raises(InputError, match="cannot be read as CSV"):
         read_csv(tmp_path / "b.csv", ("a",))
 

@@ -40,7 +40,7 @@ def test_a_mirror_exchanges_sides_and_twice_it_changes_nothing() -> None:
 
 
 def test_an_anatomy_of_ones_own_is_a_file(tmp_path: Path) -> None:
-    (tmp_path / "foot.yaml").write_text(FOOT)
+    (tmp_path / "foot.yaml").write_text(FOOT, encoding="utf-8")
     foot = load_anatomy(tmp_path / "foot.yaml")
     assert foot.name == "foot"
     assert foot.classes(["tali"]) == (1, 2)
@@ -62,7 +62,7 @@ def test_an_anatomy_of_ones_own_is_a_file(tmp_path: Path) -> None:
 )
 def test_what_does_not_fit_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert old in FOOT
-    (tmp_path / "foot.yaml").write_text(FOOT.replace(old, new))
+    (tmp_path / "foot.yaml").write_text(FOOT.replace(old, new), encoding="utf-8")
     with pytest.raises(InputError, match=message) as raised:
         load_anatomy(tmp_path / "foot.yaml")
     assert "\n" not in str(raised.value)
@@ -89,7 +89,7 @@ def test_bad_tables(tmp_path: Path) -> None:
         ("anatomy: hip\nbones: {hip_left: -1}", "above 0"),
         ("anatomy: hip\nbones: [1]", r"mine\.yaml, bones: bones with their ids were expected, .* found \[1\]"),
     ):
-        (tmp_path / "mine.yaml").write_text(text)
+        (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")
         with pytest.raises(InputError, match=message):
             label_table(tmp_path / "mine.yaml")
 

@@ -52,7 +52,9 @@ def test_points_of_slicer_and_of_the_plain_format(case: Case, against_schema: Ca
 
 
 def test_annotations_by_image_with_and_without_names(case: Case) -> None:
-    (case.folder / "px.csv").write_text("image,bead,column_px,row_px\nview1,f0,10.5,20\nview2_device.tif,,3,4\n")
+    (case.folder / "px.csv").write_text(
+        "image,bead,column_px,row_px\nview1,f0,10.5,20\nview2_device.tif,,3,4\n", encoding="utf-8"
+    )
     marks = read_beads(written(case, BOTH + "annotations: px.csv\n"), case).marks
     assert marks is not None
     assert [(mark.bead, mark.pixel) for mark in marks["view1.tif"]] == [("f0", (10.5, 20.0))]

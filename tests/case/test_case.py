@@ -75,7 +75,7 @@ def test_a_written_case_comes_back(tmp_path: Path) -> None:
     case = example(tmp_path)
     write_case(tmp_path, case)
     assert_same(read_case(tmp_path), case)
-    content = yaml.safe_load((tmp_path / "case.yaml").read_text())
+    content = yaml.safe_load((tmp_path / "case.yaml").read_text(encoding="utf-8"))
     assert content["plan"]["target"] == "FH"
     assert content["carm"] == "cios_fusion"
     assert content["views"][0] == {"anatomy": "view1.tif", "device": "view1_device.tif", "intensity": "raw"}
@@ -117,7 +117,7 @@ def test_a_device_as_a_volume_comes_back(tmp_path: Path, hu: float | None, label
     device = replace(device, model=Model(tmp_path / "device.nrrd", hu, labels))
     write_case(tmp_path, with_device(case, device))
     assert_same(device_of(read_case(tmp_path)), device)
-    written = yaml.safe_load((tmp_path / "case.yaml").read_text())["device"]
+    written = yaml.safe_load((tmp_path / "case.yaml").read_text(encoding="utf-8"))["device"]
     assert ("model" in written, written["volume"]) == (False, "device.nrrd")
 
 
@@ -125,15 +125,17 @@ def test_files_outside_the_folder_are_found_from_it(tmp_path: Path) -> None:
     case = example(tmp_path)
     (tmp_path / "made").mkdir()
     write_case(tmp_path / "made", case)
-    assert yaml.safe_load((tmp_path / "made" / "case.yaml").read_text())["ct"]["image"] == "../ct.nii.gz"
+    assert (
+        yaml.safe_load((tmp_path / "made" / "case.yaml").read_text(encoding="utf-8"))["ct"]["image"] == "../ct.nii.gz"
+    )
     assert read_case(tmp_path / "made").ct_path.samefile(tmp_path / "ct.nii.gz")
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_the_operated_femur_follows_the_side(tmp_path: Path, side: str) -> None:
     write_case(tmp_path, example(tmp_path))
-    text = (tmp_path / "case.yaml").read_text().replace("side: left", f"side: {side}")
-    (tmp_path / "case.yaml").write_text(text)
+    text = (tmp_path / "case.yaml").read_text(encoding="utf-8").replace("side: left", f"side: {side}")
+    (tmp_path / "case.yaml").write_text(text, encoding="utf-8")
     case = read_case(tmp_path)
     assert case.objects["femur"].bones == (f"femur_{side}",)
     head = case.objects["femur"].reference
@@ -230,12 +232,12 @@ BAD: list[tuple[Change, str]] = [
 def test_bad_fields(tmp_path: Path, n: int) -> None:
     change, message = BAD[n]
     write_case(tmp_path, example(tmp_path))
-    content = yaml.safe_load((tmp_path / "case.yaml").read_text())
-    landmarks = json.loads((tmp_path / "landmarks.json").read_text())
+    content = yaml.safe_load((tmp_path / "case.yaml").read_text(encoding="utf-8"))
+    landmarks = json.loads((tmp_path / "landmarks.json").read_text(encoding="utf-8"))
     del landmarks["landmarks"]["ASIS-l"]
     write_json(tmp_path / "landmarks.json", landmarks)
     change(content)
-    (tmp_path / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (tmp_path / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     with pytest.raises(InputError, match=message) as raised:
         read_case(tmp_path)
     assert "\n" not in str(raised.value)
@@ -255,7 +257,7 @@ def test_bad_fields(tmp_path: Path, n: int) -> None:
 )
 def test_bad_truth_and_landmarks(tmp_path: Path, name: str, key: str, value: Any, message: str) -> None:
     write_case(tmp_path, example(tmp_path))
-    write_json(tmp_path / name, json.loads((tmp_path / name).read_text()) | {key: value})
+    write_json(tmp_path / name, json.loads((tmp_path / name).read_text(encoding="utf-8")) | {key: value})
     with pytest.raises(InputError, match=message):
         read_case(tmp_path)
 

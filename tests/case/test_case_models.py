@@ -23,7 +23,7 @@ def write(folder: Path, model: dict[str, Any]) -> Path:
         "carm": "cios_fusion",
         "views": [{"image": "view.tif"}],
     }
-    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return folder
 
 
@@ -55,7 +55,7 @@ def test_every_form_comes_back(tmp_path: Path, form: dict[str, Any], known: bool
     assert model is not None
     assert model.materials_known == known
     write_case(tmp_path, case)
-    written = yaml.safe_load((tmp_path / "case.yaml").read_text())["objects"]["tool"]
+    written = yaml.safe_load((tmp_path / "case.yaml").read_text(encoding="utf-8"))["objects"]["tool"]
     del written["start"]
     assert written == form
     assert read_case(tmp_path).objects["tool"].model == model

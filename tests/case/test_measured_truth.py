@@ -22,7 +22,7 @@ def folder(tmp_path: Path) -> Path:
     for number in (1, 2):
         image = torch.arange(64 * 64).reshape(64, 64) + number
         write_image(tmp_path / f"v{number}.tif", image.to(torch.uint16))
-    (tmp_path / "box.stl").write_text("solid\nendsolid\n")
+    (tmp_path / "box.stl").write_text("solid\nendsolid\n", encoding="utf-8")
     start = {"camera1_from": NEAR.tolist()}
     thing = {"model": "box.stl", "hu": 1000, "start": start}
     content = {
@@ -32,7 +32,7 @@ def folder(tmp_path: Path) -> Path:
         "views": [{"image": "v1.tif"}, {"image": "v2.tif"}],
         "truth": "truth.json",
     }
-    (tmp_path / "case.yaml").write_text(yaml.safe_dump(content))
+    (tmp_path / "case.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
     return tmp_path
 
 

@@ -113,7 +113,7 @@ def test_starts_that_are_none_are_told(tmp_path: Path, content: dict[str, object
     scaled = sitk.AffineTransform(3)
     scaled.Scale(1.2)
     sitk.WriteTransform(scaled, str(tmp_path / "scaled.tfm"))
-    (tmp_path / "text.tfm").write_text("not a transform")
+    (tmp_path / "text.tfm").write_text("not a transform", encoding="utf-8")
     with pytest.raises(InputError, match=message) as raised:
         read_device_start(fields(**content), tmp_path, PATH, "left", DEVICE)
     assert "\n" not in str(raised.value)

@@ -49,8 +49,8 @@ def write(folder: Path, content: dict[str, Any]) -> Path:
     for name in ("ct.nii.gz", "labels.nii.gz", "wire.stl", "clamp.nrrd", "a.tif", "a_wire.tif", "b.tif", "b_wire.tif"):
         (folder / name).touch()
     points = {"space": "RAS", "unit": "mm", "landmarks": {"knee": [1, 2, 50], "ankle": [0, 0, -300]}}
-    (folder / "landmarks.json").write_text(json.dumps(points))
-    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (folder / "landmarks.json").write_text(json.dumps(points), encoding="utf-8")
+    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return folder
 
 
@@ -74,9 +74,9 @@ def test_objects_are_read_as_they_stand(tmp_path: Path) -> None:
 
 def test_a_written_case_of_objects_says_the_same(tmp_path: Path) -> None:
     write_case(tmp_path, read_case(write(tmp_path, CASE)))
-    first = yaml.safe_load((tmp_path / "case.yaml").read_text())
+    first = yaml.safe_load((tmp_path / "case.yaml").read_text(encoding="utf-8"))
     write_case(tmp_path, read_case(tmp_path))
-    assert yaml.safe_load((tmp_path / "case.yaml").read_text()) == first
+    assert yaml.safe_load((tmp_path / "case.yaml").read_text(encoding="utf-8")) == first
     assert first["objects"]["tibia"]["start"] == {"beside": "shank"}
     assert first["objects"]["clamp"]["start"]["beside_from_object"] == TURNED
     assert first["views"][1]["images"] == {"plain": "b.tif", "wire": "b_wire.tif"}
@@ -88,7 +88,7 @@ def test_one_kind_of_images_needs_no_name(tmp_path: Path) -> None:
     case = read_case(write(tmp_path, content | {"objects": objects, "views": [{"image": "a.tif"}]}))
     assert case.kinds == ("image",)
     write_case(tmp_path, case)
-    assert yaml.safe_load((tmp_path / "case.yaml").read_text())["views"] == [{"image": "a.tif"}]
+    assert yaml.safe_load((tmp_path / "case.yaml").read_text(encoding="utf-8"))["views"] == [{"image": "a.tif"}]
 
 
 BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [

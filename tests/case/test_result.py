@@ -76,7 +76,7 @@ def example(first: str = "pelvis", other: str = "femur", tool: str = "device") -
 
 def written(folder: Path, result: Result) -> dict[str, Any]:
     write_json(folder / "result.json", result_content(result))
-    return json.loads((folder / "result.json").read_text())
+    return json.loads((folder / "result.json").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("names", [("pelvis", "femur", "device"), ("shank", "tibia", "wire")])
@@ -220,6 +220,6 @@ def test_refined_cameras_come_back(tmp_path: Path) -> None:
 def test_cameras_of_another_number_of_views_are_refused(tmp_path: Path) -> None:
     content = written(tmp_path, example())
     content["carm_refined"] = [{"sdd_factor": 1.0, "principal_point_shift_mm": [0, 0]}]
-    (tmp_path / "result.json").write_text(json.dumps(content))
+    (tmp_path / "result.json").write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(InputError, match="carm_refined: 2 views were expected"):
         read_result(tmp_path)

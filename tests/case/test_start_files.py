@@ -14,7 +14,7 @@ EYE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 600], [0, 0, 0, 1]]
 
 
 def test_a_table_as_detect_writes_it_without_what_is_not_visible(tmp_path: Path) -> None:
-    (tmp_path / "landmarks.csv").write_text(HEADER + ROWS)
+    (tmp_path / "landmarks.csv").write_text(HEADER + ROWS, encoding="utf-8")
     found = read_pixels(tmp_path / "landmarks.csv")
     assert {name: pixel.tolist() for name, pixel in found.items()} == {"FH-l": [10.5, 20.25], "mine": [1, 2]}
 
@@ -22,7 +22,7 @@ def test_a_table_as_detect_writes_it_without_what_is_not_visible(tmp_path: Path)
 def test_markups_of_the_image_plane(tmp_path: Path) -> None:
     points = [{"label": "FH-l", "position": [10.5, 20.25, 0], "positionStatus": "defined"}]
     markup = {"coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
-    (tmp_path / "view1.mrk.json").write_text(json.dumps({"markups": [markup]}))
+    (tmp_path / "view1.mrk.json").write_text(json.dumps({"markups": [markup]}), encoding="utf-8")
     assert read_pixels(tmp_path / "view1.mrk.json")["FH-l"].tolist() == [10.5, 20.25]
 
 
@@ -39,19 +39,21 @@ def test_markups_of_the_image_plane(tmp_path: Path) -> None:
     ],
 )
 def test_bad_tables(tmp_path: Path, text: str, says: str) -> None:
-    (tmp_path / "landmarks.csv").write_text(text)
+    (tmp_path / "landmarks.csv").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=says) as raised:
         read_pixels(tmp_path / "landmarks.csv")
     assert "\n" not in str(raised.value)
 
 
 def test_start_poses_of_any_objects_and_of_an_earlier_result(tmp_path: Path) -> None:
-    (tmp_path / "start.json").write_text(json.dumps({"camera1_from_tibia": EYE, "camera_from_shank": [EYE, EYE]}))
+    (tmp_path / "start.json").write_text(
+        json.dumps({"camera1_from_tibia": EYE, "camera_from_shank": [EYE, EYE]}), encoding="utf-8"
+    )
     found = read_start_poses(tmp_path / "start.json")
     assert {name: pose.tolist() for name, pose in found.items()} == {"shank": EYE, "tibia": EYE}
 
 
 def test_a_file_without_poses_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "start.json").write_text("{}")
+    (tmp_path / "start.json").write_text("{}", encoding="utf-8")
     with pytest.raises(InputError, match="holds no start pose"):
         read_start_poses(tmp_path / "start.json")

@@ -38,10 +38,10 @@ def write(folder: Path, content: dict[str, Any]) -> Path:
     for name in ("ct.nii.gz", "labels.nii.gz", "device.stl", "view1.tif", "view1_device.tif"):
         (folder / name).touch()
     points = {"space": "LPS", "unit": "mm", "landmarks": {"FH-l": [90, 0, 0], "FH-r": [-90, 0, 0]}}
-    (folder / "landmarks.json").write_text(json.dumps(points))
+    (folder / "landmarks.json").write_text(json.dumps(points), encoding="utf-8")
     truth = {"camera_from_pelvis": [EYE], "camera1_from_femur": EYE, "camera1_from_device": EYE}
-    (folder / "truth.json").write_text(json.dumps(truth))
-    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (folder / "truth.json").write_text(json.dumps(truth), encoding="utf-8")
+    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return folder
 
 
@@ -61,7 +61,7 @@ def test_a_case_of_version_1_is_a_femoroplasty(tmp_path: Path) -> None:
 def test_written_anew_it_is_the_same_procedure(tmp_path: Path) -> None:
     case = read_case(write(tmp_path, CASE))
     write_case(tmp_path, case)
-    content = yaml.safe_load((tmp_path / "case.yaml").read_text())
+    content = yaml.safe_load((tmp_path / "case.yaml").read_text(encoding="utf-8"))
     assert content["version"] == 2
     again = read_case(tmp_path)
     assert again.bones == case.bones

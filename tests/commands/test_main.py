@@ -48,11 +48,11 @@ def measure(
 def fail(kind: str, out: Path) -> None:
     """End in the way of `kind`."""
     with new_folder(out) as built:
-        (built / "half.txt").write_text("half")
+        (built / "half.txt").write_text("half", encoding="utf-8")
         if kind == "bad":
             raise InputError("case.yaml, side: left or right\nwas expected.")
         if kind == "missing":
-            (built / "no.txt").read_text()
+            (built / "no.txt").read_text(encoding="utf-8")
         if kind == "forbidden":
             raise PermissionError(13, "Permission denied", "locked.tif")
         if kind == "full":
@@ -99,13 +99,13 @@ def test_arguments_reach_the_function(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_the_command_line_overrides_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "options.yaml").write_text("out: run\npreset: fast\nspacing_mm: 3\n")
+    (tmp_path / "options.yaml").write_text("out: run\npreset: fast\nspacing_mm: 3\n", encoding="utf-8")
     assert main(["measure", "a.png", "--config", str(tmp_path / "options.yaml"), "--spacing-mm", "4"]) == 0
     assert capsys.readouterr().out == f"{[Path('a.png')]} run cios_fusion fast 4.0 False\n"
 
 
 def test_aliases_in_a_text_of_the_file_are_not_followed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "options.yaml").write_text("out: run\nspacing_mm: '[&a [x], *a]'\n")
+    (tmp_path / "options.yaml").write_text("out: run\nspacing_mm: '[&a [x], *a]'\n", encoding="utf-8")
     assert main(["measure", "a.png", "--config", str(tmp_path / "options.yaml")]) == 2
     assert "spacing_mm: '[&a [x], *a]' holds aliases" in capsys.readouterr().err.replace("'spacing_mm'", "spacing_mm")
 
@@ -207,7 +207,7 @@ def test_options_out_of_range_are_one_line(option: str, tmp_path: Path, capsys: 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "out: !!bool abc", "a: &a [*a]", "out: run\nout: walk"])
 def test_broken_option_files_are_one_line(tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "options.yaml").write_text(text)
+    (tmp_path / "options.yaml").write_text(text, encoding="utf-8")
     assert main(["measure", "a.png", "--config", str(tmp_path / "options.yaml")]) == 2
     error = capsys.readouterr().err
     assert error.startswith("femoreg: ")
@@ -279,7 +279,7 @@ def test_the_installed_command_ends_with_its_status_after_all_that_was_registere
         f"sys.argv = ['femoreg', *{arguments!r}]\n"
         "main.console_script()"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, encoding="utf-8")
     assert ended.returncode == status
     assert ended.stdout.endswith("registered later\n")
     assert bool(ended.stderr) == (status == 2)
@@ -315,7 +315,7 @@ def test_letters_that_the_terminal_lacks_and_warnings_of_libraries(options: str,
     )
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     command = [sys.executable, *options.split(), "-c", code]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, encoding="utf-8")
     assert (done.returncode, done.stdout) == (0, "64 \\xd7 64\n")
     assert done.stderr.count("\n") == lines
 

@@ -164,10 +164,10 @@ def test_a_bad_calibration_of_the_robot_is_refused_before_the_work_begins(
     case: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     robot, run = case.parent / "robot.txt", case.parent / "run"
-    robot.write_text("base_from_device\n1 0 0\n")
+    robot.write_text("base_from_device\n1 0 0\n", encoding="utf-8")
     assert main(["register", str(case), "--out", str(run), "--robot", str(robot)]) == 2
     assert "robot.txt, line 2: four numbers" in capfd.readouterr().err
-    robot.write_text("base_from_device\n1 0 0 900\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    robot.write_text("base_from_device\n1 0 0 900\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", encoding="utf-8")
     change_yaml(case, lambda c: c.pop("device"))
     assert main(["register", str(case), "--out", str(run), "--robot", str(robot)]) == 2
     assert "no tool to steer" in capfd.readouterr().err

@@ -41,8 +41,8 @@ def test_a_name_that_is_not_there_is_told(change: dict[str, object]) -> None:
 
 
 def test_a_file_extends_a_preset_or_a_file_beside_it(tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text("extends: cios_fusion\nsdd_mm: 990\n")
-    (tmp_path / "yours.yaml").write_text("extends: mine.yaml\nshape: [768, 768]\n")
+    (tmp_path / "mine.yaml").write_text("extends: cios_fusion\nsdd_mm: 990\n", encoding="utf-8")
+    (tmp_path / "yours.yaml").write_text("extends: mine.yaml\nshape: [768, 768]\n", encoding="utf-8")
     found = load_preset("carm", tmp_path / "yours.yaml")
     assert found == load_preset("carm", "cios_fusion") | {"sdd_mm": 990, "shape": [768, 768]}
 
@@ -60,7 +60,7 @@ def test_a_file_extends_a_preset_or_a_file_beside_it(tmp_path: Path) -> None:
     ],
 )
 def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "mine.yaml").write_text(text)
+    (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message) as raised:
         load_preset("carm", tmp_path / "mine.yaml")
     assert "\n" not in str(raised.value)

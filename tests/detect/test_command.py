@@ -84,7 +84,7 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_writes_table_markups_and_picture(image: Path, weights: Path, tmp_path: Path) -> None:
     detect([image], out=tmp_path / "out", weights=weights)
-    with (tmp_path / "out" / "landmarks.csv").open() as file:
+    with (tmp_path / "out" / "landmarks.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["image", "landmark", "column_px", "row_px", "confidence", "visible"]
     assert [row["landmark"] for row in rows] == list(HIP.landmark_names)
@@ -107,7 +107,7 @@ def test_bad_input_leaves_nothing_behind(image: Path, weights: Path, tmp_path: P
     write_image(constant, torch.full((1536, 1536), 900, dtype=torch.uint16))
     write_image(small, (torch.arange(100 * 100) % 999).view(100, 100).to(torch.uint16))
     cv2.imwrite(str(colour), torch.randint(0, 255, (1536, 1536, 3)).to(torch.uint8).numpy())
-    (tmp_path / "text.png").write_text("not an image")
+    (tmp_path / "text.png").write_text("not an image", encoding="utf-8")
     for bad, message in {
         tmp_path / "missing.tif": "no such file",
         constant: "every pixel is 900",
@@ -134,7 +134,7 @@ def test_a_folder_of_images_in_every_format(image: Path, weights: Path, tmp_path
     sitk.WriteImage(sitk.GetImageFromArray(raw.numpy()[None]), str(folder / "c.nii.gz"))
     write_dicom(folder / "d", raw)
     detect([folder], out=tmp_path / "out", weights=weights)
-    with (tmp_path / "out" / "landmarks.csv").open() as file:
+    with (tmp_path / "out" / "landmarks.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     count = len(HIP.landmarks)
     assert [row["image"] for row in rows[::count]] == [str(folder / n) for n in ("a.png", "b.tif", "c.nii.gz", "d")]

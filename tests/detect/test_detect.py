@@ -136,7 +136,7 @@ def test_bad_images(image: Tensor) -> None:
 def test_bad_weights(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         load_network(tmp_path / "missing.safetensors")
-    (tmp_path / "text.safetensors").write_text("not weights")
+    (tmp_path / "text.safetensors").write_text("not weights", encoding="utf-8")
     with pytest.raises(InputError, match="cannot be read as safetensors"):
         load_network(tmp_path / "text.safetensors")
 

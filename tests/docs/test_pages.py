@@ -97,10 +97,12 @@ def test_the_similarity_of_the_tutorial_is_one_of_a_preset(tmp_path: Path, monke
     lines = [f"[{group}]", *(f"{name} = {place}" for name, place in project["project"]["entry-points"][group].items())]
     metadata = tmp_path / "my_package-0.1.dist-info"
     metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 0.1\n")
-    (metadata / "entry_points.txt").write_text("\n".join(lines))
-    (tmp_path / "my_package.py").write_text(f"from dataclasses import dataclass\n\nimport torch\n\n\n{code}")
-    (tmp_path / "my_preset.yaml").write_text(preset)
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 0.1\n", encoding="utf-8")
+    (metadata / "entry_points.txt").write_text("\n".join(lines), encoding="utf-8")
+    (tmp_path / "my_package.py").write_text(
+        f"from dataclasses import dataclass\n\nimport torch\n\n\n{code}", encoding="utf-8"
+    )
+    (tmp_path / "my_preset.yaml").write_text(preset, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     similarities = {
         step.name: getattr(step, "similarity", None) for step in load_plan(tmp_path / "my_preset.yaml").steps

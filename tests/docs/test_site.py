@@ -46,15 +46,17 @@ def address(site: Path) -> Iterator[str]:
 
 
 def test_what_leads_nowhere_or_comes_from_elsewhere_is_found(tmp_path: Path) -> None:
-    (tmp_path / "b.html").write_text('<h1 id="here">b</h1>')
-    (tmp_path / "a.html").write_text('<a href="b.html#here">b</a><a href="https://example.org">out</a>')
+    (tmp_path / "b.html").write_text('<h1 id="here">b</h1>', encoding="utf-8")
+    (tmp_path / "a.html").write_text(
+        '<a href="b.html#here">b</a><a href="https://example.org">out</a>', encoding="utf-8"
+    )
     assert checked(tmp_path).returncode == 0
     for wrong in (
         '<a href="c.html">c</a>',
         '<a href="b.html#there">b</a>',
         '<script src="//cdn.example/x.js"></script>',
     ):
-        (tmp_path / "a.html").write_text(wrong)
+        (tmp_path / "a.html").write_text(wrong, encoding="utf-8")
         found = checked(tmp_path)
         assert found.returncode == 1
         assert len(found.stderr.splitlines()) == 1

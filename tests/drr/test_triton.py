@@ -30,6 +30,7 @@ def test_kernels_through_the_interpreter():
         capture_output=True,
         text=True,
         check=False,
+        encoding="utf-8",
     )
     assert run.returncode == 0, run.stdout + run.stderr
 

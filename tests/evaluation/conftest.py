@@ -124,11 +124,11 @@ _STEPS = [
 def small_registration(procedure: tuple[Path, Path], tmp_path: Path) -> list[str]:
     """The command line, but for `--out`, of a registration of the procedure that takes a moment."""
     case, run = procedure
-    (tmp_path / "small.yaml").write_text(json.dumps({"steps": _STEPS}))
-    told = json.loads((run / "result.json").read_text())
+    (tmp_path / "small.yaml").write_text(json.dumps({"steps": _STEPS}), encoding="utf-8")
+    told = json.loads((run / "result.json").read_text(encoding="utf-8"))
     poses = {"camera1_from_pelvis": told["camera_from_pelvis"][0]}
     poses |= {name: told[name] for name in ("camera1_from_femur", "camera1_from_device")}
-    (tmp_path / "start.json").write_text(json.dumps(poses))
+    (tmp_path / "start.json").write_text(json.dumps(poses), encoding="utf-8")
     return [
         "register", str(case), "--preset", str(tmp_path / "small.yaml"), "--start", str(tmp_path / "start.json")
     ]  # fmt: skip

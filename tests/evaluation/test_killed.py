@@ -30,14 +30,14 @@ def test_a_registration_that_is_killed(small_registration: list[str], how: signa
     began = time.perf_counter()
     assert started(arguments).wait() == 0
     longest = time.perf_counter() - began
-    (runs / "run" / "notes.txt").write_text("mine")
+    (runs / "run" / "notes.txt").write_text("mine", encoding="utf-8")
     seeds = [0]
     for n in range(1, ROUNDS):
         process = started([*arguments, "--seed", str(n)])
         time.sleep(longest * (draw.random() if n % 2 else draw.uniform(0.9, 1.05)))  # half of them while it writes
         process.send_signal(how)
         process.wait()
-        result = json.loads((runs / "run" / "result.json").read_text())
+        result = json.loads((runs / "run" / "result.json").read_text(encoding="utf-8"))
         assert result["seed"] in (seeds[-1], n), f"seed {SEED}"
         assert {path.name for path in (runs / "run").iterdir()} == {
             "result.json", "navigation.json", "navigation", "notes.txt"
@@ -45,4 +45,4 @@ def test_a_registration_that_is_killed(small_registration: list[str], how: signa
         seeds.append(result["seed"])
     assert started(arguments).wait() == 0
     assert [path.name for path in runs.iterdir()] == ["run"]
-    assert (runs / "run" / "notes.txt").read_text() == "mine"
+    assert (runs / "run" / "notes.txt").read_text(encoding="utf-8") == "mine"

@@ -26,7 +26,7 @@ _OFF_MM = (4.0, -3.0, 15.0)  # where the search starts, beside the truth
 
 def memory_mb() -> float:
     """Resident memory of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
@@ -42,21 +42,23 @@ def open_files_and_threads() -> tuple[int, int]:
 def command(tmp_path: Path) -> list[str]:
     """The command line, but for `--out`, of a registration."""
     write_phantom(tmp_path / "patient", 31, "left", 2.0)
-    (tmp_path / "carm.yaml").write_text(yaml.safe_dump(_CARM | {"orbit_axis": [0, 1, 0]}))
-    (tmp_path / "sim.yaml").write_text(yaml.safe_dump({"extends": "paper", "carm": str(tmp_path / "carm.yaml")}))
+    (tmp_path / "carm.yaml").write_text(yaml.safe_dump(_CARM | {"orbit_axis": [0, 1, 0]}), encoding="utf-8")
+    (tmp_path / "sim.yaml").write_text(
+        yaml.safe_dump({"extends": "paper", "carm": str(tmp_path / "carm.yaml")}), encoding="utf-8"
+    )
     write_simulation(tmp_path / "patient", tmp_path / "case", 5, "left", str(tmp_path / "sim.yaml"), lambda _: None)
-    truth = json.loads((tmp_path / "case" / "truth.json").read_text())
+    truth = json.loads((tmp_path / "case" / "truth.json").read_text(encoding="utf-8"))
     poses = {"camera1_from_pelvis": truth["camera_from_pelvis"][0], "camera1_from_femur": truth["camera1_from_femur"]}
     for pose in poses.values():
         for row, mm in enumerate(_OFF_MM):
             pose[row][3] += mm
-    (tmp_path / "start.json").write_text(json.dumps(poses))
+    (tmp_path / "start.json").write_text(json.dumps(poses), encoding="utf-8")
     preset = load_preset("registration", "fast")
     for step in preset["steps"]:
         step |= {"level": {"pixel_mm": 6.2, "step_mm": 2}} if "level" in step else {}
         if "candidates" in step.get("optimiser", {}):
             step["optimiser"] |= {"candidates": 40, "starts": 2}
-    (tmp_path / "coarse.yaml").write_text(yaml.safe_dump(preset))
+    (tmp_path / "coarse.yaml").write_text(yaml.safe_dump(preset), encoding="utf-8")
     files = {"--start": "start.json", "--preset": "coarse.yaml"}
     return ["register", str(tmp_path / "case"), *(w for k, name in files.items() for w in (k, str(tmp_path / name)))]
 
@@ -64,7 +66,7 @@ def command(tmp_path: Path) -> list[str]:
 def registered(arguments: list[str], out: Path) -> dict[str, Any]:
     """What a registration writes, but for how long it took."""
     assert main([*arguments, "--out", str(out)]) == 0
-    content: dict[str, Any] = json.loads((out / "result.json").read_text())
+    content: dict[str, Any] = json.loads((out / "result.json").read_text(encoding="utf-8"))
     del content["timings_s"]
     for stage in content["stages"]:
         del stage["seconds"]

@@ -99,7 +99,7 @@ def damaged(kind: str, folder: Path) -> Path:
     floats = PIXELS.astype(np.float32)
     floats[3, 4] = np.nan
     if kind == "text":
-        path.write_text("not an image")
+        path.write_text("not an image", encoding="utf-8")
     elif kind == "empty":
         path.write_bytes(b"")
     elif kind == "colour":
@@ -111,7 +111,7 @@ def damaged(kind: str, folder: Path) -> Path:
         path.write_bytes(path.read_bytes()[:30])
     elif kind == "no dicom":
         path = folder / "view.jpeg2"
-        path.write_text("not an image")
+        path.write_text("not an image", encoding="utf-8")
     elif kind.startswith("nan"):
         path = folder / f"view.{kind.removeprefix('nan ')}"
         sitk.WriteImage(sitk.GetImageFromArray(floats), str(path))

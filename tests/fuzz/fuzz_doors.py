@@ -143,7 +143,7 @@ def _case(folder: Path) -> Iterator[Door]:
     del first["template"], first["ct"]["bones"]
     for name, content in (("short", short), ("objects", objects), ("version 1", first)):
         yield _own_folder(folder, f"case, {name}", "case.yaml", content, read_case)
-    (folder / "case.yaml").write_text(yaml.safe_dump(short))
+    (folder / "case.yaml").write_text(yaml.safe_dump(short), encoding="utf-8")
     yield Door("truth", folder / "truth.json", lambda: read_case(folder), truth)
     yield _written(
         "label table",

@@ -82,7 +82,7 @@ def prepared(out: Path, name: str, given: Path, old: bool) -> None:
     if old:
         for file in ("result.json", "navigation.json", "report.html", "case.yaml", "notes.txt"):
             if not (out / file).exists():
-                (out / file).write_text("old")
+                (out / file).write_text("old", encoding="utf-8")
 
 
 def arguments(command: list[str], out: Path) -> list[str]:
@@ -162,14 +162,14 @@ def test_weights_are_exported_whole_or_not_at_all(size: int, tmp_path: Path) -> 
     network = settings.network.build()
     state_dict = {f"network.{name}": tensor for name, tensor in network.state_dict().items()}
     torch.save({"state_dict": state_dict, "global_step": 7}, tmp_path / "best.ckpt")
-    (tmp_path / "w.safetensors").write_text("old")
+    (tmp_path / "w.safetensors").write_text("old", encoding="utf-8")
 
     def export() -> Path:
         return export_weights(tmp_path / "best.ckpt", settings, tmp_path / "w.safetensors")
 
     with full_after(size), pytest.raises(OSError, match=r"w\.safetensors"):
         export()
-    assert (tmp_path / "w.safetensors").read_text() == "old"
+    assert (tmp_path / "w.safetensors").read_text(encoding="utf-8") == "old"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["best.ckpt", "w.safetensors"]
     _fails_at_every_step(export, tmp_path)
 

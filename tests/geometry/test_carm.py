@@ -111,11 +111,11 @@ def test_a_missing_key_is_named(key):
 
 
 def test_a_c_arm_may_stand_in_a_file_and_extend_a_preset(tmp_path):
-    (tmp_path / "mine.yaml").write_text("extends: cios_fusion\nsdd_mm: 990\n")
+    (tmp_path / "mine.yaml").write_text("extends: cios_fusion\nsdd_mm: 990\n", encoding="utf-8")
     carm = load_carm(tmp_path / "mine.yaml")
     assert carm.camera == replace(CARM.camera, sdd_mm=990.0)
     assert carm.isocentre_mm == CARM.isocentre_mm
-    (tmp_path / "odd.yaml").write_text("extends: cios_fusion\nsdd: 990\n")
+    (tmp_path / "odd.yaml").write_text("extends: cios_fusion\nsdd: 990\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"odd.yaml: unknown key 'sdd'"):
         load_carm(tmp_path / "odd.yaml")
 

@@ -83,16 +83,16 @@ def write_files(folder: Path) -> Path:
     folder.mkdir(exist_ok=True)
     nibabel.save(nibabel.Nifti1Image(hu(), ras_affine()), folder / "ct.nii.gz")
     nibabel.save(nibabel.Nifti1Image(label_values(), ras_affine()), folder / "labels.nii.gz")
-    (folder / "landmarks.mrk.json").write_text(markups(landmarks()))
-    (folder / "plan.mrk.json").write_text(markups({"L-1": ENTRY, "L-2": HEAD}, "RAS", "Line"))
+    (folder / "landmarks.mrk.json").write_text(markups(landmarks()), encoding="utf-8")
+    (folder / "plan.mrk.json").write_text(markups({"L-1": ENTRY, "L-2": HEAD}, "RAS", "Line"), encoding="utf-8")
     trimesh.creation.cylinder(radius=4, height=100, sections=12).export(folder / "device.stl")
-    (folder / "points.mrk.json").write_text(markups({"tip": TIP, "base": BASE}))
+    (folder / "points.mrk.json").write_text(markups({"tip": TIP, "base": BASE}), encoding="utf-8")
     generator = np.random.default_rng(1)
     for kind in ("", "_device"):
         for view in (1, 2, 3):
             image = generator.integers(1000, 50000, (48, 40)).astype(np.uint16)
             cv2.imwrite(str(folder / f"view{view}{kind}.png"), image)
-    (folder / "carm.yaml").write_text("{sdd_mm: 1000, pixel_mm: [4, 4], shape: [48, 40]}\n")
+    (folder / "carm.yaml").write_text("{sdd_mm: 1000, pixel_mm: [4, 4], shape: [48, 40]}\n", encoding="utf-8")
     return folder
 
 
@@ -117,4 +117,4 @@ def case_content() -> dict[str, Any]:
 
 
 def write_content(folder: Path, content: dict[str, Any]) -> None:
-    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")

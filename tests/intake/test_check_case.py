@@ -34,25 +34,33 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def renamed(c: Content, folder: Path, **names: str) -> None:
-    (folder / "landmarks.mrk.json").write_text(markups({names.get(k, k): v for k, v in landmarks().items()}))
+    (folder / "landmarks.mrk.json").write_text(
+        markups({names.get(k, k): v for k, v in landmarks().items()}), encoding="utf-8"
+    )
 
 
 def swapped(c: Content, folder: Path) -> None:
     other = {"l": "r", "r": "l"}
-    (folder / "landmarks.mrk.json").write_text(markups({k[:-1] + other[k[-1]]: v for k, v in landmarks().items()}))
+    (folder / "landmarks.mrk.json").write_text(
+        markups({k[:-1] + other[k[-1]]: v for k, v in landmarks().items()}), encoding="utf-8"
+    )
 
 
 def moved(c: Content, folder: Path, name: str, to: tuple[float, ...]) -> None:
-    (folder / "landmarks.mrk.json").write_text(markups(landmarks() | {name: to}))
+    (folder / "landmarks.mrk.json").write_text(markups(landmarks() | {name: to}), encoding="utf-8")
 
 
 def few(c: Content, folder: Path) -> None:
-    (folder / "landmarks.mrk.json").write_text(markups({k: landmarks()[k] for k in ("FH-l", "ASIS-l", "FH-r")}))
+    (folder / "landmarks.mrk.json").write_text(
+        markups({k: landmarks()[k] for k in ("FH-l", "ASIS-l", "FH-r")}), encoding="utf-8"
+    )
 
 
 def flipped(c: Content, folder: Path) -> None:
     """Points of RAS in a file that says LPS."""
-    (folder / "landmarks.mrk.json").write_text(markups({k: (-x, -y, z) for k, (x, y, z) in landmarks().items()}))
+    (folder / "landmarks.mrk.json").write_text(
+        markups({k: (-x, -y, z) for k, (x, y, z) in landmarks().items()}), encoding="utf-8"
+    )
 
 
 def relabelled(c: Content, folder: Path, old: int, new: int) -> None:
@@ -121,7 +129,10 @@ FAULTS: dict[str, Fault] = {
         lambda c, f: shutil.copy(f / "view1_device.png", f / "view3_device.png"),
         r"views\[2\]\.device: the same image as views\[0\]\.device",
     ),
-    "view text": (lambda c, f: (f / "view1.png").write_text("text"), r"view1\.png: cannot be read as a PNG"),
+    "view text": (
+        lambda c, f: (f / "view1.png").write_text("text", encoding="utf-8"),
+        r"view1\.png: cannot be read as a PNG",
+    ),
     "intensity": (lambda c, f: c["views"][1].update(intensity="dark"), r"views\[1\]\.intensity: raw or log"),
     "field": (
         lambda c, f: c["views"][0].update(field={"circle": {"centre": [1, 2], "radius": -3}}),
@@ -233,7 +244,7 @@ def test_the_registration_refuses_swapped_sides_and_tells_what_was_done_to_a_lab
 
 def test_what_is_no_case_is_told(tmp_path: Path) -> None:
     assert "holds no case.yaml" in check_case(tmp_path).problems[0]
-    (tmp_path / "case.yaml").write_text("- a list")
+    (tmp_path / "case.yaml").write_text("- a list", encoding="utf-8")
     assert "a mapping of keys and values was expected" in check_case(tmp_path).problems[0]
 
 

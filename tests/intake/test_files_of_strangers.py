@@ -191,11 +191,11 @@ def test_markups_of_3d_slicer_with_numbers_for_the_space(tmp_path: Path, system:
         point |= {"associatedNodeID": "", "orientation": [-1.0, 0, 0, 0, -1, 0, 0, 0, 1], "selected": n > 2}
     unplaced = {"id": "20", "label": "GSN-l", "position": [None] * 3, "positionStatus": "undefined"}
     markup["controlPoints"].append(unplaced)
-    (tmp_path / "f.mrk.json").write_text(json.dumps(content | {"markups": [markup]}))
+    (tmp_path / "f.mrk.json").write_text(json.dumps(content | {"markups": [markup]}), encoding="utf-8")
     found = read_landmarks(tmp_path / "f.mrk.json")
     assert {name: tuple(point.tolist()) for name, point in found.items()} == landmarks()
     del markup["coordinateSystem"]
-    (tmp_path / "f.mrk.json").write_text(json.dumps(content | {"markups": [markup]}))
+    (tmp_path / "f.mrk.json").write_text(json.dumps(content | {"markups": [markup]}), encoding="utf-8")
     with pytest.raises(InputError, match=r"does not say it\. Write `.coordinateSystem.: .LPS.`"):
         read_landmarks(tmp_path / "f.mrk.json")
 
@@ -205,7 +205,7 @@ def test_a_picture_does_not_take_the_place_of_what_it_is_made_of(
 ) -> None:
     image = np.random.default_rng(0).integers(0, 4000, (20, 20), dtype=np.uint16)
     (tmp_path / "case").mkdir()
-    (tmp_path / "case" / "case.yaml").write_text("views: [{anatomy: view1.png}]\n")
+    (tmp_path / "case" / "case.yaml").write_text("views: [{anatomy: view1.png}]\n", encoding="utf-8")
     for path in (tmp_path / "a.png", tmp_path / "case" / "view1.png"):
         cv2.imwrite(str(path), image)
         before = path.read_bytes()

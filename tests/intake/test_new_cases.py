@@ -39,7 +39,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for number in (1, 2, 3):
             write_dicom_image(folder / kind / f"run{number}", number + (10 if kind == "device" else 0))
     aside = "{sdd_mm: 1000, pixel_mm: [4, 4], shape: [48, 40], principal_point_px: [20.5, 23.5]}\n"
-    (folder / "aside.yaml").write_text(aside)
+    (folder / "aside.yaml").write_text(aside, encoding="utf-8")
     return folder
 
 
@@ -175,7 +175,7 @@ def test_other_forms_give_the_same_bones(files: Path, tmp_path: Path, changes: d
     for name, (number, *_) in case.bones.items():
         if name != "vertebrae":
             assert np.array_equal((labels == number).numpy(), sitk_mask(files, name))
-    content = yaml.safe_load((tmp_path / "case" / "case.yaml").read_text())
+    content = yaml.safe_load((tmp_path / "case" / "case.yaml").read_text(encoding="utf-8"))
     assert ("device" in content) == (changes.get("device", "") is not None)
 
 
@@ -242,7 +242,7 @@ def test_headers_say_side_and_values_and_flags_may_say_otherwise(
     assert "ignore_header: true" in told
     told = made("mine", frames=1, source="anterior", ignore_header=True, turned=90, carm=files / "aside.yaml")
     assert "Case written" in told, told
-    content = yaml.safe_load((tmp_path / "mine" / "case.yaml").read_text())
+    content = yaml.safe_load((tmp_path / "mine" / "case.yaml").read_text(encoding="utf-8"))
     assert content["display"] == {"source": "anterior", "mirrored": False, "turned": 90, "ignore_header": True}
     assert [view["frames"] for view in content["views"]] == [1, 1]
     assert "holds intensities (raw) by its PixelInt" in made("logs", frames=1, intensity="log")
@@ -262,10 +262,10 @@ def test_headers_say_side_and_values_and_flags_may_say_otherwise(
 
 def test_a_folder_that_is_there_is_not_touched(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "case").mkdir()
-    (tmp_path / "case" / "mine").write_text("x")
+    (tmp_path / "case" / "mine").write_text("x", encoding="utf-8")
     assert main(arguments(files, tmp_path / "case")) == 2
     assert "is there already" in capsys.readouterr().err
-    assert (tmp_path / "case" / "mine").read_text() == "x"
+    assert (tmp_path / "case" / "mine").read_text(encoding="utf-8") == "x"
 
 
 @pytest.mark.parametrize(
@@ -291,7 +291,7 @@ def test_inspect_says_what_is_there(files: Path, name: str, kind: str, fact: str
 
 
 def test_inspect_lists_what_stands_together(files: Path, tmp_path: Path) -> None:
-    (files / "torn.stl").write_text("solid of nothing")
+    (files / "torn.stl").write_text("solid of nothing", encoding="utf-8")
     found = inspect_path(files)
     (files / "torn.stl").unlink()
     assert found.kind == "folder of several things"
@@ -333,7 +333,7 @@ def test_inspect_tells_other_points_and_boxes_of_segments_without_alarm(files: P
 def test_inspect_warns_of_swapped_landmarks_and_unclear_headers(files: Path, tmp_path: Path) -> None:
     other = {"l": "r", "r": "l"}
     swapped = {name[:-1] + other[name[-1]]: point for name, point in landmarks().items()}
-    (tmp_path / "marks.mrk.json").write_text(markups(swapped))
+    (tmp_path / "marks.mrk.json").write_text(markups(swapped), encoding="utf-8")
     assert "lie to the right of their partners" in inspect_path(tmp_path / "marks.mrk.json").warnings[0]
     image = nibabel.load(files / "ct.nii.gz")
     image.header.set_sform(None, 0)
@@ -400,7 +400,7 @@ def test_a_folder_as_it_was_exported(files: Path, tmp_path: Path, capsys: pytest
         (tmp_path / kind / "DICOM").mkdir(parents=True)
         for n in (2, 10, 1):
             write_dicom_image(tmp_path / kind / f"DICOM/IM{n}", seed + n)
-        (tmp_path / kind / "README").write_text("A viewer for this disc.")
+        (tmp_path / kind / "README").write_text("A viewer for this disc.", encoding="utf-8")
         report = dataset("1.2.840.10008.5.1.4.1.1.88.67", "SR", generate_uid())
         report.save_as(tmp_path / kind / "dose", enforce_file_format=True)
     given = {"images": [tmp_path / "plain"], "device_images": [tmp_path / "device"]}
@@ -410,6 +410,6 @@ def test_a_folder_as_it_was_exported(files: Path, tmp_path: Path, capsys: pytest
     assert "view 2 is DICOM/IM2, with the device DICOM/IM2" in told
     assert "view 3 is DICOM/IM10, with the device DICOM/IM10" in told
     (tmp_path / "empty").mkdir()
-    (tmp_path / "empty" / "README").write_text("nothing")
+    (tmp_path / "empty" / "README").write_text("nothing", encoding="utf-8")
     assert main(arguments(files, tmp_path / "none", images=[tmp_path / "empty"])) == 2
     assert "empty: a folder without images" in capsys.readouterr().err

@@ -70,13 +70,16 @@ def rows(matrix: Matrix) -> str:
 
 
 def write_flange(path: Path) -> Path:
-    path.write_text(f"""# robot A
+    path.write_text(
+        f"""# robot A
 base_from_flange   # forward kinematics, mm
 {rows(BASE_FROM_FLANGE)}
 
 flange_from_device
 {rows(FLANGE_FROM_DEVICE).replace(" ", ", ")}
-""")
+""",
+        encoding="utf-8",
+    )
     return path
 
 
@@ -226,17 +229,17 @@ def test_a_result_without_trust_says_so_everywhere(tmp_path: Path, capsys: pytes
 
 def test_a_result_that_does_not_speak_of_trust_has_none(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
-    content = json.loads((run / "result.json").read_text())
+    content = json.loads((run / "result.json").read_text(encoding="utf-8"))
     del content["quality"], content["trusted"]
-    (run / "result.json").write_text(json.dumps(content))
+    (run / "result.json").write_text(json.dumps(content), encoding="utf-8")
     assert main(["navigate", str(run)]) == 0
-    assert json.loads((run / "navigation.json").read_text())["trusted"] is False
+    assert json.loads((run / "navigation.json").read_text(encoding="utf-8"))["trusted"] is False
 
 
 def test_a_new_navigation_leaves_nothing_of_the_old_one(tmp_path: Path) -> None:
     run, _ = navigated(tmp_path)
     assert main(["navigate", str(run)]) == 0
-    assert "base_from_femur" not in json.loads((run / "navigation.json").read_text())
+    assert "base_from_femur" not in json.loads((run / "navigation.json").read_text(encoding="utf-8"))
     assert {path.stem for path in (run / "navigation").iterdir()} == {"femur_from_device", "correction_in_device"}
 
 
@@ -252,8 +255,8 @@ def test_every_kind_of_calibration_file_gives_the_same(tmp_path: Path) -> None:
     by_flange = read_robot(write_flange(tmp_path / "robot.txt"), "device")
     torch.testing.assert_close(by_flange.base_from_tool, expected)
     assert by_flange.base_from_flange is not None
-    (tmp_path / "direct.txt").write_text(f"base_from_device\n{rows(expected.numpy())}")
-    (tmp_path / "base_from_device.txt").write_text(f"# bare\n{rows(expected.numpy())}")
+    (tmp_path / "direct.txt").write_text(f"base_from_device\n{rows(expected.numpy())}", encoding="utf-8")
+    (tmp_path / "base_from_device.txt").write_text(f"# bare\n{rows(expected.numpy())}", encoding="utf-8")
     transform = sitk.Euler3DTransform()
     device_from_base = np.linalg.inv(expected.numpy())
     transform.SetMatrix(device_from_base[:3, :3].flatten().tolist(), 1e-9)
@@ -266,7 +269,7 @@ def test_every_kind_of_calibration_file_gives_the_same(tmp_path: Path) -> None:
 
 
 def test_few_digits_do_not_leave_a_rotation_that_is_none(tmp_path: Path) -> None:
-    (tmp_path / "base_from_device.txt").write_text(rows(np.round(pose(7), 5)))
+    (tmp_path / "base_from_device.txt").write_text(rows(np.round(pose(7), 5)), encoding="utf-8")
     rotation = read_robot(tmp_path / "base_from_device.txt", "device").base_from_tool[:3, :3]
     torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), atol=1e-12, rtol=0)
 
@@ -286,21 +289,57 @@ def write_scaled_tfm(path: Path) -> None:
 BAD: list[tuple[str, Callable[[Path], object], str]] = [
     ("missing.txt", lambda path: None, "no such file"),
     ("folder.txt", lambda path: path.mkdir(), "no such file"),
-    ("empty.txt", lambda path: path.write_text("# nothing\n"), "holds no matrix"),
+    ("empty.txt", lambda path: path.write_text("# nothing\n", encoding="utf-8"), "holds no matrix"),
     ("picture.txt", lambda path: path.write_bytes(b"\x89PNG\xff\xfe\x00"), "is not text"),
-    ("robot.txt", lambda path: path.write_text(rows(pose(5))), "holds `robot`. Expected"),
-    ("a.txt", lambda path: path.write_text(f"base_from_flange\n{rows(pose(5))}"), "holds `base_from_flange`. Expected"),
-    ("a.txt", lambda path: path.write_text(f"base_from_hand\n{rows(pose(5))}"), "line 1: four numbers or the name"),
-    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(pose(5)[:3])}"), "3 rows found"),
-    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(pose(5)[:, :3])}"), "line 2: four numbers"),
-    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(changed(1, 1, np.nan))}"), "not finite"),
-    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(changed(0, 3, np.inf))}"), "not finite"),
-    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(pose(5) * 1.1)}"), "not a rigid transform"),
-    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(pose(5).T)}"), "not a rigid transform"),
-    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(pose(5) @ np.diag([1, 1, -1, 1]))}"), "mirrored"),
-    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(pose(5, 0.5))}"), "in metres"),
-    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(pose(5))}\n" * 2), "stands there twice"),
-    ("a.tfm", lambda path: path.write_text("garbage"), "cannot be read as an ITK transform"),
+    ("robot.txt", lambda path: path.write_text(rows(pose(5)), encoding="utf-8"), "holds `robot`. Expected"),
+    (
+        "a.txt",
+        lambda path: path.write_text(f"base_from_flange\n{rows(pose(5))}", encoding="utf-8"),
+        "holds `base_from_flange`. Expected",
+    ),
+    (
+        "a.txt",
+        lambda path: path.write_text(f"base_from_hand\n{rows(pose(5))}", encoding="utf-8"),
+        "line 1: four numbers or the name",
+    ),
+    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(pose(5)[:3])}", encoding="utf-8"), "3 rows found"),
+    (
+        "a.txt",
+        lambda path: path.write_text(f"base_from_device\n{rows(pose(5)[:, :3])}", encoding="utf-8"),
+        "line 2: four numbers",
+    ),
+    (
+        "a.txt",
+        lambda path: path.write_text(f"base_from_device\n{rows(changed(1, 1, np.nan))}", encoding="utf-8"),
+        "not finite",
+    ),
+    (
+        "a.txt",
+        lambda path: path.write_text(f"base_from_device\n{rows(changed(0, 3, np.inf))}", encoding="utf-8"),
+        "not finite",
+    ),
+    (
+        "a.txt",
+        lambda path: path.write_text(f"base_from_device\n{rows(pose(5) * 1.1)}", encoding="utf-8"),
+        "not a rigid transform",
+    ),
+    (
+        "a.txt",
+        lambda path: path.write_text(f"base_from_device\n{rows(pose(5).T)}", encoding="utf-8"),
+        "not a rigid transform",
+    ),
+    (
+        "a.txt",
+        lambda path: path.write_text(f"base_from_device\n{rows(pose(5) @ np.diag([1, 1, -1, 1]))}", encoding="utf-8"),
+        "mirrored",
+    ),
+    ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(pose(5, 0.5))}", encoding="utf-8"), "in metres"),
+    (
+        "a.txt",
+        lambda path: path.write_text(f"base_from_device\n{rows(pose(5))}\n" * 2, encoding="utf-8"),
+        "stands there twice",
+    ),
+    ("a.tfm", lambda path: path.write_text("garbage", encoding="utf-8"), "cannot be read as an ITK transform"),
     ("base_from_device.tfm", write_scaled_tfm, "not a rigid transform"),
     ("other.tfm", lambda path: sitk.WriteTransform(sitk.Euler3DTransform(), str(path)), "holds `other`"),
 ]

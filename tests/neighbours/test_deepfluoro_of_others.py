@@ -156,7 +156,7 @@ def test_itk_transforms_come_back(tmp_path: Path, name: str) -> None:
 
 
 def test_what_is_missing_is_named(tmp_path: Path, full: Path) -> None:
-    (tmp_path / "text.h5").write_text("nothing")
+    (tmp_path / "text.h5").write_text("nothing", encoding="utf-8")
     for path, message in ((tmp_path / "no.h5", "no such file"), (tmp_path / "text.h5", "cannot be read as HDF5")):
         with pytest.raises(InputError, match=message):
             is_full_resolution(path)

@@ -66,9 +66,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory, solids: tuple[Volume, Volum
     (made / "case.yaml").write_text(
         "version: 2\ntemplate: femoroplasty\nside: left\n"
         "ct: {image: ct.nii.gz, labels: labels.nii.gz, bones: femoreg}\nlandmarks: landmarks.json\n"
-        "plan: {entry_point: [86, 5, 100], target: FH}\ncarm: cios_fusion\n"
+        "plan: {entry_point: [86, 5, 100], target: FH}\ncarm: cios_fusion\n",
+        encoding="utf-8",
     )
-    (made / "preset.yaml").write_text(PRESET)
+    (made / "preset.yaml").write_text(PRESET, encoding="utf-8")
     return made
 
 
@@ -235,17 +236,17 @@ def test_files_tell_the_plan(
     plan: FemoroplastyPlan,
     against_schema: Callable[[str, Any], list[str]],
 ) -> None:
-    content = json.loads((written / "plan.json").read_text())
+    content = json.loads((written / "plan.json").read_text(encoding="utf-8"))
     assert not against_schema("plan", content)
     assert against_schema("plan", content | {"unit": "m"})
     np.testing.assert_allclose(content["plan"]["entry_point"], plan.path.entry, atol=1e-9)
     assert content["planned"]["gain"] == pytest.approx(plan.gain)
     assert content["calibrated"] is False
-    text = (folder / "case.yaml").read_text()
+    text = (folder / "case.yaml").read_text(encoding="utf-8")
     replaced = text.replace("plan: {entry_point: [86, 5, 100], target: FH}", f"plan: {json.dumps(content['plan'])}")
     other = written / "case"
     other.mkdir()
-    (other / "case.yaml").write_text(replaced)
+    (other / "case.yaml").write_text(replaced, encoding="utf-8")
     for name in ("ct.nii.gz", "labels.nii.gz", "landmarks.json"):
         (other / name).symlink_to(folder / name)
     read = read_case(other).plan  # as a case takes it
@@ -270,7 +271,7 @@ def test_files_tell_the_plan(
     stored = read_plan(written)
     assert stored.planning == prepared.planning
     assert stored.path.length_mm == pytest.approx(plan.path.length_mm)
-    line = json.loads((written / "path.mrk.json").read_text())["markups"][0]
+    line = json.loads((written / "path.mrk.json").read_text(encoding="utf-8"))["markups"][0]
     np.testing.assert_allclose(line["controlPoints"][1]["position"], plan.path.target, atol=1e-9)
 
 
@@ -283,9 +284,9 @@ def test_commands_end_to_end(
     assert "Calibration: uncalibrated" in capsys.readouterr().out
     assert {"plan.json", "curves.png", "overlay.png", "fields.vtu", "cement.stl"} <= {p.name for p in out.iterdir()}
     assert main(["plan-offsets", str(out)]) == 0
-    offsets = json.loads((out / "offsets.json").read_text())
+    offsets = json.loads((out / "offsets.json").read_text(encoding="utf-8"))
     assert set(offsets["outcomes"]) == SIX | ENDS
-    content = json.loads((out / "plan.json").read_text())
+    content = json.loads((out / "plan.json").read_text(encoding="utf-8"))
     assert "response" in content
     assert not against_schema("plan", content)
     planned = content["planned"]["yield_load_n"]
@@ -300,12 +301,14 @@ def test_commands_end_to_end(
     columns = {f"{name}_mm_{axis}": [0.4, -0.7] for name in ("femur", "device") for axis in ("lr", "ap", "is")}
     parquet.write_table(table(columns), study / "runs.parquet")
     assert main(["plan-robustness", str(out), "--study", str(study), "--draws", "1"]) == 0
-    found = json.loads((out / "robustness.json").read_text())  # both err alike: the path is where it was planned
+    found = json.loads(
+        (out / "robustness.json").read_text(encoding="utf-8")
+    )  # both err alike: the path is where it was planned
     assert found["gain_percent_median"] == pytest.approx(found["planned_gain_percent"])
-    (folder / "sure.csv").write_text("0,0,0\n0,0,0\n0,0,0\n")
+    (folder / "sure.csv").write_text("0,0,0\n0,0,0\n0,0,0\n", encoding="utf-8")
     shift = ["--covariance", str(folder / "sure.csv"), "--mean", f"[{-response.distance_mm}, 0, 0]", "--draws", "1"]
     assert main(["plan-robustness", str(out), *shift]) == 0
-    found = json.loads((out / "robustness.json").read_text())
+    found = json.loads((out / "robustness.json").read_text(encoding="utf-8"))
     assert found["gain_percent_median"] == pytest.approx(offsets["outcomes"]["medial"][0]["gain_percent"])
     capsys.readouterr()
     bad = folder / "bad"
@@ -347,13 +350,13 @@ def test_a_turned_path_keeps_its_entry_and_is_run_anew(prepared: Prepared, plan:
 
 
 def test_the_path_of_a_plan_is_read_by_a_case(written: File, folder: File, plan: FemoroplastyPlan) -> None:
-    text = (folder / "case.yaml").read_text()
+    text = (folder / "case.yaml").read_text(encoding="utf-8")
     other = folder / "by_file"
     other.mkdir()
     for name in ("ct.nii.gz", "labels.nii.gz", "landmarks.json"):
         (other / name).symlink_to(folder / name)
     by_file = text.replace("{entry_point: [86, 5, 100], target: FH}", "{file: ../plan/plan.json}")
-    (other / "case.yaml").write_text(by_file)
+    (other / "case.yaml").write_text(by_file, encoding="utf-8")
     case = read_case(other)
     assert case.plan is not None
     np.testing.assert_allclose(case.plan.entry_point, plan.path.entry, atol=1e-9)
@@ -368,7 +371,7 @@ def test_the_path_of_a_plan_is_read_by_a_case(written: File, folder: File, plan:
         (by_file.replace("plan.json}", "plan.json, target: FH}"), "stands in the `file` of the plan already"),
         (by_file.replace("side: left", "side: right"), "is a plan for the left femur"),
     ):
-        (other / "case.yaml").write_text(changed)
+        (other / "case.yaml").write_text(changed, encoding="utf-8")
         write_landmarks(folder / "again" / "landmarks.json", {"FH-l": plan_head(), "FH-r": plan_head()})
         (other / "landmarks.json").unlink(missing_ok=True)
         (other / "landmarks.json").symlink_to(folder / "again" / "landmarks.json")
@@ -385,7 +388,7 @@ def test_the_report_tells_the_plan(written: File, folder: File, plan: Femoroplas
     result = Result(Poses(pose[None], {"femur": pose}), {"femur": good}, path_covariance=covariance)
     assert planning(Material(case, None, result, None, None)) is None  # its path is no plan's
     file = folder / "with_response.json"
-    content = json.loads((written / "plan.json").read_text())
+    content = json.loads((written / "plan.json").read_text(encoding="utf-8"))
     sloped = Response(100 * plan.gain, np.array([5.0, 0, 0, 0, 0]), np.zeros(5), 4.0, plan.path.entry, plan.path.target)
     write_json(file, content | {"response": response_content(sloped)})
     case = dataclasses.replace(case, plan=dataclasses.replace(case.plan, file=file))
@@ -463,7 +466,7 @@ def test_a_case_that_cannot_be_planned_is_told_in_one_line(
 def test_a_path_that_leaves_the_bone_is_told_in_one_line(
     written: File, tmp_path: File, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    content = json.loads((written / "plan.json").read_text())
+    content = json.loads((written / "plan.json").read_text(encoding="utf-8"))
     for point in content["plan"].values():
         point[1] += 60.0
     (tmp_path / "cement.nii.gz").symlink_to(written / "cement.nii.gz")

@@ -145,11 +145,11 @@ def test_what_is_no_covariance_is_told(mean: np.ndarray, covariance: np.ndarray,
 
 def test_covariances_are_read_from_text_and_from_results(tmp_path: File) -> None:
     wanted = np.diag([1.0, 2.0, 3.0])
-    (tmp_path / "a.csv").write_text("1, 0, 0\n0,2,0\n0,0,3\n")
-    (tmp_path / "a.txt").write_text("1 0 0\n0 2 0\n\n0 0 3\n")
+    (tmp_path / "a.csv").write_text("1, 0, 0\n0,2,0\n0,0,3\n", encoding="utf-8")
+    (tmp_path / "a.txt").write_text("1 0 0\n0 2 0\n\n0 0 3\n", encoding="utf-8")
     write_json(tmp_path / "result.json", {"path_covariance": np.eye(6)})
     write_json(tmp_path / "old.json", {"version": 2})
-    (tmp_path / "bad.txt").write_text("1 0 0\n0 two 0\n")
+    (tmp_path / "bad.txt").write_text("1 0 0\n0 two 0\n", encoding="utf-8")
     for name in ("a.csv", "a.txt"):
         np.testing.assert_array_equal(read_covariance(tmp_path / name), wanted)
     np.testing.assert_array_equal(read_covariance(tmp_path / "result.json"), np.eye(6))
@@ -180,4 +180,4 @@ def write_runs(folder: File, columns: dict[str, Any], suffix: str) -> None:
         parquet.write_table(table(columns), folder / "runs.parquet")
         return
     lines = [",".join(columns), *(",".join(str(values[n]) for values in columns.values()) for n in range(3))]
-    (folder / "runs.csv").write_text("\n".join(lines) + "\n")
+    (folder / "runs.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -199,9 +199,9 @@ def test_a_header_against_the_case(tmp_path: Path) -> None:
 def test_a_carm_from_the_header(tmp_path: Path) -> None:
     write_dicom(tmp_path / "view.dcm", RAW, "MONOCHROME2", DistanceSourceToDetector=990, ImagerPixelSpacing=[0.3, 0.2])
     case_of(tmp_path, Display(turned_deg=90), "view.dcm")
-    text = (tmp_path / "case.yaml").read_text()
+    text = (tmp_path / "case.yaml").read_text(encoding="utf-8")
     start, end = text.index("carm:"), text.index("display:")
-    (tmp_path / "case.yaml").write_text(text[:start] + "carm: dicom\n" + text[end:])
+    (tmp_path / "case.yaml").write_text(text[:start] + "carm: dicom\n" + text[end:], encoding="utf-8")
     camera = read_case(tmp_path).carm.camera
     assert (camera.sdd_mm, camera.pixel_mm, camera.shape) == (990, (0.2, 0.3), (50, 40))  # turned upright
 
@@ -220,6 +220,6 @@ def test_displays_that_cannot_be(tmp_path: Path, line: str, message: str) -> Non
     write_image(tmp_path / "view.tif", RAW.to(torch.uint16))
     case_of(tmp_path, Display(), "view.tif")
     path = tmp_path / "case.yaml"
-    path.write_text(path.read_text() + line + "\n")
+    path.write_text(path.read_text(encoding="utf-8") + line + "\n", encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_case(tmp_path)

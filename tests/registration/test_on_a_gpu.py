@@ -262,6 +262,7 @@ def test_the_kernels_through_the_interpreter_have_the_objective_of_the_cpu() -> 
         capture_output=True,
         text=True,
         check=False,
+        encoding="utf-8",
     )
     assert run.returncode == 0, run.stdout + run.stderr
 

@@ -106,7 +106,7 @@ def test_the_fiducial_preset_finds_the_views_by_the_device_alone() -> None:
 
 def test_a_file_may_change_a_preset(tmp_path: Path) -> None:
     change = {"name": "orbit search", "half_range_deg": 20}
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"extends": "fast", "steps": [change]}))
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"extends": "fast", "steps": [change]}), encoding="utf-8")
     fast, mine = load_plan("fast"), load_plan(tmp_path / "mine.yaml")
     assert [step.name for step in mine.steps] == [step.name for step in fast.steps]
     (orbit,) = (step for step in mine.steps if step not in fast.steps)
@@ -132,7 +132,7 @@ def test_a_file_may_change_a_preset(tmp_path: Path) -> None:
     ],
 )
 def test_a_mistake_is_told_with_preset_and_step(change: dict[str, object], says: str, tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"steps": [STAGE | change]}))
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"steps": [STAGE | change]}), encoding="utf-8")
     with pytest.raises(InputError, match=f"mine.yaml, {says}"):
         load_plan(tmp_path / "mine.yaml")
 
@@ -155,6 +155,6 @@ def test_a_preset_holds_steps_and_nothing_else() -> None:
 
 @pytest.mark.parametrize("text", ["steps: []\n", "extends: fast\nsteps: []\n"])
 def test_a_preset_without_steps_is_refused(text: str, tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text(text)
+    (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=r"mine\.yaml, steps: none is left"):
         load_plan(tmp_path / "mine.yaml")

@@ -160,7 +160,7 @@ def test_what_is_placed_is_kept_until_it_is_forgotten(drawn_scene: DrawnScene, p
     again = with_kept(run, case, scene, first)
     assert again.landmarks == {"FH-l": (10.25, 20.5)}
     assert torch.allclose(again.poses.camera1_from["femur"], placed.poses.camera1_from["femur"], atol=1e-8)
-    start_path(run).write_text('{"camera1_from_nose": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}')
+    start_path(run).write_text('{"camera1_from_nose": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', encoding="utf-8")
     with pytest.raises(InputError, match=r"run\.start\.json: there is no object 'nose'"):
         with_kept(run, case, scene, first)
     forget(run)

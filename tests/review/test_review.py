@@ -177,7 +177,7 @@ def test_a_review_of_another_result_does_not_count(client: TestClient, run: Path
     ],
 )
 def test_a_file_that_is_no_review_is_one_line(run: Path, content: str, says: str) -> None:
-    (run / REVIEW_NAME).write_text(content)
+    (run / REVIEW_NAME).write_text(content, encoding="utf-8")
     with pytest.raises(InputError, match=says):
         read_review(run)
 

@@ -38,7 +38,7 @@ def test_the_label_map_lies_on_the_voxels_of_the_file(ct_in_ras: Path, tmp_path:
     assert made.get_data_dtype() == np.uint8
     _, truth = hip_scene(SPACING)
     assert dice(read_label_map(tmp_path / "labels.nii.gz").data, truth, FEMUR_LEFT) > 0.95
-    told = json.loads((tmp_path / "labels.json").read_text())
+    told = json.loads((tmp_path / "labels.json").read_text(encoding="utf-8"))
     assert told["table"] == "femoreg"
     assert set(told["confidence"]) == {"hip_left", "femur_left"}
     assert (tmp_path / "labels.png").stat().st_size > 1000
@@ -63,7 +63,7 @@ def test_on_a_full_disk_the_older_files_stay(
     size: int, ct_in_ras: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("labels.nii.gz", "labels.json", "labels.png"):
-        (tmp_path / name).write_text("old")
+        (tmp_path / name).write_text("old", encoding="utf-8")
     there = sorted(tmp_path.iterdir())
     with full_after(size):
         assert main(["segment", str(ct_in_ras), "--out", str(tmp_path / "labels.nii.gz")]) == 2
@@ -71,7 +71,9 @@ def test_on_a_full_disk_the_older_files_stay(
     assert error.count("\n") == 1
     assert ".part" not in error
     assert sorted(tmp_path.iterdir()) == there
-    assert {(tmp_path / f"labels.{suffix}").read_text() for suffix in ("nii.gz", "json", "png")} == {"old"}
+    assert {(tmp_path / f"labels.{suffix}").read_text(encoding="utf-8") for suffix in ("nii.gz", "json", "png")} == {
+        "old"
+    }
 
 
 def test_the_head_is_proposed_and_what_is_not_there_left_out(

@@ -86,7 +86,7 @@ def test_a_figure_holds_every_error() -> None:
 
 def test_a_file_that_holds_no_bounds_is_refused(tmp_path: Path) -> None:
     assert read_bounds(tmp_path) is None
-    (tmp_path / BOUNDS_NAME).write_text("no parquet")
+    (tmp_path / BOUNDS_NAME).write_text("no parquet", encoding="utf-8")
     with pytest.raises(InputError, match="cannot be read as Parquet"):
         read_bounds(tmp_path)
     pd.DataFrame({"number": [1]}).to_parquet(tmp_path / BOUNDS_NAME)
@@ -95,7 +95,9 @@ def test_a_file_that_holds_no_bounds_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_page_holds_the_tables_and_the_figure(tmp_path: Path) -> None:
-    (tmp_path / "limits.md").write_text("# Limits\n\nA head.\n\n## Measured\n\nold\n\n## Tests\n\nkept\n")
+    (tmp_path / "limits.md").write_text(
+        "# Limits\n\nA head.\n\n## Measured\n\nold\n\n## Tests\n\nkept\n", encoding="utf-8"
+    )
     text = write_limits(made_up(2), made_up_bounds(), "the command", tmp_path, tmp_path)
     page = (tmp_path / "limits.md").read_text(encoding="utf-8")
     assert text in page

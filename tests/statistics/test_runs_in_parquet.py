@@ -52,7 +52,7 @@ def test_what_cannot_be_a_study_is_refused_in_one_line(change, says, tmp_path: P
 def test_a_missing_file_and_one_that_is_no_parquet_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_rows(tmp_path / "runs.parquet")
-    (tmp_path / "runs.parquet").write_text("number,patient\n1,2\n")
+    (tmp_path / "runs.parquet").write_text("number,patient\n1,2\n", encoding="utf-8")
     with pytest.raises(InputError, match="cannot be read as Parquet"):
         read_rows(tmp_path / "runs.parquet")
 

@@ -31,7 +31,7 @@ MOST_STEPS = 400
 def prepared(case: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """The command line but for `--out`; its views are rendered."""
     folder = tmp_path_factory.mktemp("prepared")
-    (folder / "tiny.yaml").write_text(SETTINGS)
+    (folder / "tiny.yaml").write_text(SETTINGS, encoding="utf-8")
     train(str(folder / "tiny.yaml"), out=folder / "first", cases=[case], cache=folder / "cache")
     return ["train", str(folder / "tiny.yaml"), "--cases", f"[{case}]", "--cache", str(folder / "cache")]
 
@@ -43,7 +43,7 @@ def whole(out: Path) -> None:
     if (out / "hip14.safetensors").exists():
         load_network(out / "hip14.safetensors")
     if (out / "settings.json").exists():
-        json.loads((out / "settings.json").read_text())
+        json.loads((out / "settings.json").read_text(encoding="utf-8"))
 
 
 def failing_at(n: int, prepared: list[str], out: Path, capsys: pytest.CaptureFixture[str]) -> bool:
@@ -128,10 +128,10 @@ def test_checkpoints_do_not_come_from_another_disk(
 def test_a_case_that_lacks_a_landmark(case: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(case, tmp_path / "case")
     path = tmp_path / "case" / "landmarks.json"
-    content = json.loads(path.read_text())
+    content = json.loads(path.read_text(encoding="utf-8"))
     del content["landmarks"]["FH-r"]
-    path.write_text(json.dumps(content))
-    (tmp_path / "tiny.yaml").write_text(SETTINGS)
+    path.write_text(json.dumps(content), encoding="utf-8")
+    (tmp_path / "tiny.yaml").write_text(SETTINGS, encoding="utf-8")
     arguments = ["train", str(tmp_path / "tiny.yaml"), "--cases", f"[{tmp_path / 'case'}]"]
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
     told = capsys.readouterr().err

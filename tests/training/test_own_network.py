@@ -79,16 +79,18 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An installed package `mine`, as far as Python can tell."""
     site = tmp_path / "site"
     (site / "mine-1.0.dist-info").mkdir(parents=True)
-    (site / "mine-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
-    (site / "mine-1.0.dist-info" / "entry_points.txt").write_text(ENTRY_POINTS)
-    (site / "mine.py").write_text(MODULE)
+    (site / "mine-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n", encoding="utf-8"
+    )
+    (site / "mine-1.0.dist-info" / "entry_points.txt").write_text(ENTRY_POINTS, encoding="utf-8")
+    (site / "mine.py").write_text(MODULE, encoding="utf-8")
     monkeypatch.syspath_prepend(site)
     monkeypatch.delitem(sys.modules, "mine", raising=False)
 
 
 @pytest.mark.usefixtures("mine")
 def test_a_network_and_a_loss_of_ones_own(case: Path, tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text(SETTINGS)
+    (tmp_path / "mine.yaml").write_text(SETTINGS, encoding="utf-8")
     train(str(tmp_path / "mine.yaml"), out=tmp_path / "run", cases=[case])
     network = load_network(tmp_path / "run" / "hip14.safetensors")
     assert type(network.module).__name__ == "Shallow"
@@ -98,11 +100,13 @@ def test_a_network_and_a_loss_of_ones_own(case: Path, tmp_path: Path) -> None:
     found = detect(network, torch.rand(camera.shape, generator=torch.Generator().manual_seed(1)), camera)
     assert found.segmentation.shape == (7, 96, 96)
     assert len(found.visible) == 14
-    columns = (tmp_path / "run" / "csv" / "version_0" / "metrics.csv").read_text().splitlines()[0].split(",")
+    columns = (
+        (tmp_path / "run" / "csv" / "version_0" / "metrics.csv").read_text(encoding="utf-8").splitlines()[0].split(",")
+    )
     assert {"train/loss", "train/focal", "train/presence"} <= set(columns)
 
 
 def test_without_the_package_its_kind_is_unknown(tmp_path: Path) -> None:
-    (tmp_path / "mine.yaml").write_text(SETTINGS)
+    (tmp_path / "mine.yaml").write_text(SETTINGS, encoding="utf-8")
     with pytest.raises(InputError, match=r"mine\.yaml, network: unknown kind 'shallow'.*multitask_unet"):
         train(str(tmp_path / "mine.yaml"), out=tmp_path / "run")

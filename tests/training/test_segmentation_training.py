@@ -117,7 +117,7 @@ def test_a_run_is_resumed_and_its_weights_are_read(tmp_path: Path) -> None:
         train_segmentation(settings, paths, out, tmp_path, False, told.append)
     train_segmentation(replace(settings, steps=3), paths, out, tmp_path, True, told.append)
     assert "step 3" in told[-1]
-    assert len((out / "progress.csv").read_text().splitlines()) == 4
+    assert len((out / "progress.csv").read_text(encoding="utf-8").splitlines()) == 4
     assert load_bone_network(weights).multiple == 4
     checkpoint = out / "checkpoint.pt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:-100])

@@ -35,7 +35,7 @@ def test_the_pelvis_comes_back(case: Path, tmp_path: Path) -> None:
     turn = rigid(exp_so3(torch.deg2rad(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))))
     shift = rigid(translation=torch.tensor([3.0, -4.0, 0.0], dtype=torch.float64))
     preset = tmp_path / "refinement.yaml"
-    preset.write_text(REFINEMENT)
+    preset.write_text(REFINEMENT, encoding="utf-8")
     found = single_view_registration(case, str(preset))(labelled, shift @ about_point(turn, middle) @ TRUTH)
     assert torch.rad2deg(rotation_angle(TRUTH[:3, :3].mT @ found[:3, :3])) < 0.3
     off = (transform_points(found, torch.zeros(1, 3).double()) - middle)[0]

@@ -46,7 +46,7 @@ workers: 0
 @pytest.fixture
 def settings(tmp_path: Path) -> str:
     path = tmp_path / "tiny.yaml"
-    path.write_text(SETTINGS)
+    path.write_text(SETTINGS, encoding="utf-8")
     return str(path)
 
 

@@ -209,7 +209,7 @@ def test_one_of_several_series_is_chosen(tmp_path: Path) -> None:
     write_series(folder, number=3)
     write_series(folder, number=5, description="Hip 1.0 B30", values=VALUES[::-1].copy())
     write_series(folder, number=1, description="Topogram", values=VALUES[:1], ImageType=["ORIGINAL", "LOCALIZER"])
-    (folder / "README.txt").write_text("of the scanner")
+    (folder / "README.txt").write_text("of the scanner", encoding="utf-8")
     assert [(one.number, len(one.slices)) for one in series_in(folder)] == [("1", 1), ("3", 7), ("5", 7)]
     with pytest.raises(InputError, match=r"holds 2 DICOM series.*series 3 “Hip 2.5 B60” \(CT, 7 files\), series 5"):
         read_ct(folder)

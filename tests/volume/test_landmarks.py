@@ -57,7 +57,7 @@ FILES = {
 
 @pytest.mark.parametrize("name", FILES)
 def test_all_formats_give_the_same_lps_points_in_the_same_order(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_text(FILES[name])
+    (tmp_path / name).write_text(FILES[name], encoding="utf-8")
     found = read_landmarks(tmp_path / name)
     assert list(found) == ["FH-l", "GSN-r"]
     for key, point in expected().items():
@@ -66,7 +66,7 @@ def test_all_formats_give_the_same_lps_points_in_the_same_order(tmp_path: Path, 
 
 def test_fcsv_without_a_header_is_ras_and_has_the_columns_of_slicer(tmp_path: Path) -> None:
     rows = [line for line in fcsv("RAS", RAS_HEAD, RAS_NOTCH).splitlines() if not line.startswith("#")]
-    (tmp_path / "points.fcsv").write_text("\n".join(rows))
+    (tmp_path / "points.fcsv").write_text("\n".join(rows), encoding="utf-8")
     found = read_landmarks(tmp_path / "points.fcsv")
     for key, point in expected().items():
         assert torch.equal(found[key], point)
@@ -76,7 +76,7 @@ def test_several_lists_each_in_its_own_space_and_names_spelt_otherwise(tmp_path:
     first = slicer("LPS", HEAD, NOTCH, controlPoints=[{"label": "fh_L", "position": HEAD}])
     second = slicer("RAS", HEAD, NOTCH, controlPoints=[{"label": "GSN R", "position": RAS_NOTCH}])
     content = {"markups": first["markups"] + second["markups"]}
-    (tmp_path / "points.mrk.json").write_text(json.dumps(content))
+    (tmp_path / "points.mrk.json").write_text(json.dumps(content), encoding="utf-8")
     found = read_landmarks(tmp_path / "points.mrk.json")
     assert list(found) == ["FH-l", "GSN-r"]
     for key, point in expected().items():
@@ -86,7 +86,7 @@ def test_several_lists_each_in_its_own_space_and_names_spelt_otherwise(tmp_path:
 def path_file(folder: Path, names: list[str], **changes: Any) -> Path:
     points = [{"label": name, "position": [10.0 * n, 1, 2]} for n, name in enumerate(names, 1)]
     path = folder / "plan.mrk.json"
-    path.write_text(json.dumps(slicer("LPS", HEAD, NOTCH, controlPoints=points, **changes)))
+    path.write_text(json.dumps(slicer("LPS", HEAD, NOTCH, controlPoints=points, **changes)), encoding="utf-8")
     return path
 
 
@@ -152,7 +152,7 @@ BAD = {
 @pytest.mark.parametrize("kind", BAD)
 def test_bad_files(tmp_path: Path, kind: str) -> None:
     content, message = BAD[kind]
-    (tmp_path / "points.json").write_text(content)
+    (tmp_path / "points.json").write_text(content, encoding="utf-8")
     with pytest.raises(InputError, match=message) as raised:
         read_landmarks(tmp_path / "points.json")
     assert "points.json" in str(raised.value)
@@ -168,13 +168,13 @@ def test_bad_files(tmp_path: Path, kind: str) -> None:
     ],
 )
 def test_bad_fcsv(tmp_path: Path, change: tuple[str, str], message: str) -> None:
-    (tmp_path / "points.fcsv").write_text(fcsv("LPS", HEAD, NOTCH).replace(*change))
+    (tmp_path / "points.fcsv").write_text(fcsv("LPS", HEAD, NOTCH).replace(*change), encoding="utf-8")
     with pytest.raises(InputError, match=message):
         read_landmarks(tmp_path / "points.fcsv")
 
 
 def test_an_fcsv_that_is_another_table_names_the_point(tmp_path: Path) -> None:
-    (tmp_path / "points.fcsv").write_text("# Markups fiducial file version = 4.11\n1,2,3\n")
+    (tmp_path / "points.fcsv").write_text("# Markups fiducial file version = 4.11\n1,2,3\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"point 1 \(no name\): three finite numbers"):
         read_landmarks(tmp_path / "points.fcsv")
 

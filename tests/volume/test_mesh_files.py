@@ -55,9 +55,9 @@ def test_a_3mf_file_tells_its_unit(tmp_path: Path) -> None:
 def test_groups_of_an_obj_file_are_bodies(tmp_path: Path, before: str) -> None:
     """Also where they stand within a single object, and where the materials of a renderer run across them."""
     write(tmp_path / "objects.obj")
-    text = (tmp_path / "objects.obj").read_text().replace("\no ", "\ng ")
+    text = (tmp_path / "objects.obj").read_text(encoding="utf-8").replace("\no ", "\ng ")
     lines = [f"usemtl {line[2:]}\n{line}" if line.startswith("g ") else line for line in text.splitlines()]
-    (tmp_path / "device.obj").write_text(before + "\n".join(lines))
+    (tmp_path / "device.obj").write_text(before + "\n".join(lines), encoding="utf-8")
     check_bodies(read_bodies(tmp_path / "device.obj", ["sleeve", "handle"]))
 
 
@@ -93,12 +93,12 @@ def test_a_corner_that_lacks_a_coordinate(tmp_path: Path) -> None:
     lines = HANDLE.export(file_type="obj").splitlines(keepends=True)
     second = [number for number, line in enumerate(lines) if line.startswith("v ")][1]
     lines[second] = " ".join(lines[second].split()[:3]) + "\n"
-    (tmp_path / "device.obj").write_text("".join(lines))
+    (tmp_path / "device.obj").write_text("".join(lines), encoding="utf-8")
     with pytest.raises(InputError, match=r"device\.obj: a corner lacks a coordinate"):
         read_mesh(tmp_path / "device.obj")
 
 
 def test_step_says_what_to_export(tmp_path: Path) -> None:
-    (tmp_path / "device.STEP").write_text("ISO-10303-21;")
+    (tmp_path / "device.STEP").write_text("ISO-10303-21;", encoding="utf-8")
     with pytest.raises(InputError, match=r"device\.STEP: is a STEP file\. Export it as STL, or as 3MF"):
         read_mesh(tmp_path / "device.STEP")

@@ -167,7 +167,7 @@ def damaged(kind: str, folder: Path) -> Path:
     path = folder / "ct.nii.gz"
     image = ct_image()
     if kind == "text":
-        path.write_text("not an image")
+        path.write_text("not an image", encoding="utf-8")
     elif kind == "flat":
         sitk.WriteImage(image[:, :, 2], str(path))
     elif kind == "nan":

@@ -99,7 +99,7 @@ def test_other_label_ids_give_the_same_scene_bit_for_bit(demo: Path, tmp_path: P
 
 def test_a_result_that_is_not_trusted_ends_in_status_3_if_trust_is_required(demo: Path, tmp_path: Path) -> None:
     """A preset of one's own that hardly looks: its result says that it must not be trusted."""
-    (tmp_path / "one_step.yaml").write_text(ONE_STEP)
+    (tmp_path / "one_step.yaml").write_text(ONE_STEP, encoding="utf-8")
     arguments = ["register", str(demo / "case"), "--preset", str(tmp_path / "one_step.yaml"), "--out"]
     assert main([*arguments, str(tmp_path / "run"), "--require-trust"]) == 3
     result = result_of(tmp_path / "run")
@@ -112,7 +112,7 @@ def test_a_result_that_is_not_trusted_ends_in_status_3_if_trust_is_required(demo
 def test_a_registration_starts_where_a_file_says(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "one_step.yaml").write_text(ONE_STEP)
+    (tmp_path / "one_step.yaml").write_text(ONE_STEP, encoding="utf-8")
     arguments = ["register", str(demo / "case"), "--preset", str(tmp_path / "one_step.yaml"), "--out"]
     start = ["--start", str(demo / "run" / "result.json")]
     assert main([*arguments, str(tmp_path / "run"), *start]) == 0
@@ -132,7 +132,7 @@ def test_a_batch_keeps_what_is_done_and_tells_what_was_refused(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     preset, runs = tmp_path / "one_step.yaml", tmp_path / "runs"
-    preset.write_text(ONE_STEP)
+    preset.write_text(ONE_STEP, encoding="utf-8")
     cases = [tmp_path / name for name in ("first", "second", "broken")]
     for case in cases:
         shutil.copytree(demo / "case", case)

@@ -28,11 +28,11 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Case:
     """Six images with the source behind the patient, as the source sees them."""
     folder = tmp_path_factory.mktemp("behind")
     write_phantom(folder / "patient", 31, "left", 1.0)
-    (folder / "carm.yaml").write_text(yaml.safe_dump(_CARM | {"orbit_axis": [0, 1, 0]}))
+    (folder / "carm.yaml").write_text(yaml.safe_dump(_CARM | {"orbit_axis": [0, 1, 0]}), encoding="utf-8")
     settings = {"extends": "paper", "carm": str(folder / "carm.yaml")}
     # the device stands beyond the patient, between him and the detector
     orbit = {"acquisition": {"orbit_deg": [[180, 0], [190, 3], [165, 3]], "device_depth_mm": 820}}
-    (folder / "sim.yaml").write_text(yaml.safe_dump(settings | orbit))
+    (folder / "sim.yaml").write_text(yaml.safe_dump(settings | orbit), encoding="utf-8")
     write_simulation(folder / "patient", folder / "case", 5, "left", str(folder / "sim.yaml"), lambda _: None)
     return read_case(folder / "case")
 
@@ -122,10 +122,10 @@ def test_a_procedure_from_behind_is_found_however_it_is_stored(simulated: Case, 
 def test_a_first_view_from_a_side_starts_from_landmarks_picked_by_hand(tmp_path: Path) -> None:
     write_phantom(tmp_path / "patient", 31, "left", 1.0)
     carm = _CARM | {"isocentre_mm": [0, 0, 640], "orbit_axis": [0, 1, 0]}
-    (tmp_path / "carm.yaml").write_text(yaml.safe_dump(carm))
+    (tmp_path / "carm.yaml").write_text(yaml.safe_dump(carm), encoding="utf-8")
     orbit = {"orbit_deg": [[95, 3], [122, 2], [68, 2]], "head_depth_mm": 660, "device_depth_mm": 600}
     settings = {"extends": "paper", "carm": str(tmp_path / "carm.yaml"), "acquisition": orbit}
-    (tmp_path / "sim.yaml").write_text(yaml.safe_dump(settings))
+    (tmp_path / "sim.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
     write_simulation(tmp_path / "patient", tmp_path / "case", 5, "left", str(tmp_path / "sim.yaml"), lambda _: None)
     case = stored(read_case(tmp_path / "case"), tmp_path / "stored", Display("right"), "MONOCHROME2", 1)
     assert case.truth is not None

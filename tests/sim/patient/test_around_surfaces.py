@@ -88,7 +88,7 @@ def test_landmarks_are_those_of_the_distance_fields(skeleton: Skeleton, surfaces
 def test_a_file_that_does_not_fit_is_named(surfaces: dict[str, trimesh.Trimesh], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_surfaces(tmp_path / "none.npz")
-    (tmp_path / "text.npz").write_text("no archive")
+    (tmp_path / "text.npz").write_text("no archive", encoding="utf-8")
     with pytest.raises(InputError, match="NumPy archive"):
         read_surfaces(tmp_path / "text.npz")
     few = {bone: mesh for bone, mesh in surfaces.items() if bone != "sacrum"}

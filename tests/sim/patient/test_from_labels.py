@@ -121,7 +121,7 @@ def test_the_patient_around_the_bones(labels: Volume, points: dict[str, NDArray[
 
 
 def test_what_is_missing_is_named(labels: Volume, tmp_path: Path) -> None:
-    (tmp_path / "map.nii.gz").write_text("no image")
+    (tmp_path / "map.nii.gz").write_text("no image", encoding="utf-8")
     with pytest.raises(InputError, match="cannot be read"):
         read_label_map(tmp_path / "map.nii.gz")
     with pytest.raises(InputError, match="sacrum, label 77"):

@@ -132,7 +132,7 @@ def test_conditions_stand_side_by_side(tmp_path: Path) -> None:
 def test_a_section_takes_the_place_of_its_older_self(tmp_path: Path) -> None:
     for title, text in (("A", "first"), ("B", "second"), ("A", "third\n\n### part")):
         write_section(tmp_path, title, text)
-    page = (tmp_path / "accuracy.md").read_text()
+    page = (tmp_path / "accuracy.md").read_text(encoding="utf-8")
     assert "first" not in page
     assert page.index("third") < page.index("### part") < page.index("second")
     assert page.startswith("# Accuracy")

@@ -210,7 +210,7 @@ def test_runs_of_other_code_are_made_anew_unless_they_are_asked_for(
 def test_a_damaged_record_is_made_anew(tmp_path: Path) -> None:
     run_study(study(3, Cheap()), tmp_path, HERE)
     before = rows(tmp_path)
-    next((tmp_path / "runs").glob("*-00002-*.json")).write_text("{")
+    next((tmp_path / "runs").glob("*-00002-*.json")).write_text("{", encoding="utf-8")
     run_study(study(3, Cheap()), tmp_path, HERE)
     assert rows(tmp_path) == before
 

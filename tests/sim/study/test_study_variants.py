@@ -98,7 +98,7 @@ def test_unknown_steps_and_keys_are_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no step “pelvis in view 9”"):
         plan_of(Variant("wrong", "derivative_free", without=["pelvis in view 9"]))
     path = tmp_path / "variants.yaml"
-    path.write_text("preset: demo\nvariants: [{name: a, minus: [b]}]\n")
+    path.write_text("preset: demo\nvariants: [{name: a, minus: [b]}]\n", encoding="utf-8")
     with pytest.raises(InputError, match="minus"):
         read_variants(path)
 

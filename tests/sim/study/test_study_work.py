@@ -128,9 +128,9 @@ def test_a_recorded_case_is_registered_as_it_is(
     assert changed.settings != run.settings
     # and without a truth nothing can be drawn from it
     (kept / "truth.json").unlink()
-    case = yaml.safe_load((kept / "case.yaml").read_text())
+    case = yaml.safe_load((kept / "case.yaml").read_text(encoding="utf-8"))
     case.pop("truth")
-    (kept / "case.yaml").write_text(yaml.safe_dump(case))
+    (kept / "case.yaml").write_text(yaml.safe_dump(case), encoding="utf-8")
     with pytest.raises(InputError, match="has no truth"):
         plan_study(str(tmp_path / "own.yaml"), None, tmp_path / "out", None, False)
 
