@@ -44,7 +44,7 @@ def run_without_extras(code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", hide + code], cwd=ROOT, capture_output=True, encoding="utf-8")
 
 
-COMMAND = "from femoreg_torch.commands.main import main; sys.exit(main({}))"
+COMMAND = "from femoreg_torch.commands.main import main, prepare_process; prepare_process(); sys.exit(main({}))"
 
 
 @pytest.mark.parametrize(

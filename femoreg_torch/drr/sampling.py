@@ -16,10 +16,14 @@ from femoreg_torch.volume.grid import Volume
 _OFF_GRID = 0.25
 
 
+def middle_index(volume: Volume) -> list[float]:
+    """Homogeneous index (x, y, z, 1) of about the middle of a volume."""
+    return [(n - 1) // 2 + _OFF_GRID for n in reversed(volume.data.shape)] + [1.0]
+
+
 def middle_of(volume: Volume, camera_from_volume: Tensor) -> Tensor:
     """About the middle of a volume in the camera frame, (B, 3) mm float64, for poses (B, 4, 4), where these are."""
-    index = [(n - 1) // 2 + _OFF_GRID for n in reversed(volume.data.shape)]
-    middle = transform_points(volume.lps_from_index, torch.tensor([index], dtype=torch.float64))
+    middle = transform_points(volume.lps_from_index, torch.tensor([middle_index(volume)[:3]], dtype=torch.float64))
     there = middle.to(camera_from_volume.device, non_blocking=True)
     return transform_points(camera_from_volume.to(torch.float64), there)[:, 0]
 

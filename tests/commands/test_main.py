@@ -279,7 +279,7 @@ def test_the_installed_command_ends_with_its_status_after_all_that_was_registere
         f"sys.argv = ['femoreg', *{arguments!r}]\n"
         "main.console_script()"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, encoding="utf-8")
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8")
     assert ended.returncode == status
     assert ended.stdout.endswith("registered later\n")
     assert bool(ended.stderr) == (status == 2)
@@ -310,12 +310,12 @@ def test_letters_that_the_terminal_lacks_and_warnings_of_libraries(options: str,
     code = (
         "import sys, warnings\n"
         "from femoreg_torch.commands import main\n"
-        "main._carry_out = lambda *_: (warnings.warn('of a library'), print('64 \u00d7 64'), 0)[2]\n"
+        "main._carry_out = lambda *_: (warnings.warn('of a library'), print('64 \\u00d7 64'), 0)[2]\n"
         "main.console_script()"
     )
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     command = [sys.executable, *options.split(), "-c", code]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, encoding="utf-8")
+    done = subprocess.run(command, env=environment, capture_output=True, check=False, encoding="utf-8")
     assert (done.returncode, done.stdout) == (0, "64 \\xd7 64\n")
     assert done.stderr.count("\n") == lines
 

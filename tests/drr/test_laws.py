@@ -180,6 +180,14 @@ def test_a_pose_renders_the_same_alone_and_in_a_batch():
         assert torch.equal(project(volumes, pose[None], DEVIATING_CAMERA)[0], image)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_image_is_the_same_with_and_without_a_gradient(dtype):
+    generator = torch.Generator().manual_seed(9)
+    volume, poses = centred(smooth((30, 26, 34), generator)), random_poses(3, 1, generator)[:, 0].to(dtype)
+    followed = project(volume, poses.clone().requires_grad_(), CAMERA)
+    close(project(volume, poses, CAMERA), followed.detach(), 1e-6)
+
+
 def test_two_runs_agree_bit_for_bit():
     generator = torch.Generator().manual_seed(8)
     volume, poses = centred(smooth((30, 30, 30), generator)), random_poses(4, 1, generator)

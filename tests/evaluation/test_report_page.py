@@ -57,7 +57,7 @@ def test_nothing_comes_from_outside_and_only_the_pages_own_scripts_run(case, sce
 
 
 def test_names_of_users_stay_text(case, scene, result, drawn) -> None:
-    spoilt_case = replace(case, folder=Path("/" + EVIL.replace("/", "∕")), landmarks={EVIL: case.landmarks["FH-l"]})
+    spoilt_case = replace(case, folder=Path("/" + EVIL.replace("/", "|")), landmarks={EVIL: case.landmarks["FH-l"]})
     qualities = {name: replace(value, reason=EVIL) for name, value in result.quality.items()}
     spoilt = replace(result, quality=qualities, skipped=(EVIL,), doubts=(EVIL,), preset=EVIL, versions={EVIL: EVIL})
     page = html.fromstring(report_page(spoilt_case, scene, spoilt, None, drawn))

@@ -48,7 +48,7 @@ class Server:
     def __init__(self, order: Order) -> None:
         command = [sys.executable, "-m", "femoreg_torch.commands.main", "review", str(order.case)]
         options = ["--out", str(order.out), "--preset", order.preset]
-        self.process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True, encoding="utf-8")
+        self.process = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, encoding="utf-8")
         assert self.process.stdout is not None
         found = next(filter(None, (re.search(r"http://\S+/", line) for line in self.process.stdout)), None)
         assert found is not None
