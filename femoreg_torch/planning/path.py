@@ -174,6 +174,12 @@ class Worth:
         return float((self.base + self.worth @ room_ml).min())
 
 
+def joined(first: Worth, second: Worth) -> Worth:
+    """The same places, with the mechanisms of both."""
+    base, worth = np.concatenate([first.base, second.base]), np.concatenate([first.worth, second.worth])
+    return Worth(first.points, first.room_ml, base, worth)
+
+
 def covered(
     path_direction: Array, middles: Array, axes: Array, worth: Worth, volume_ml: float
 ) -> tuple[Array, Array, float]:

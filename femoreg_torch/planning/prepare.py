@@ -13,6 +13,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.planning.calibration import calibrate
 from femoreg_torch.planning.curve import Curve, Press
 from femoreg_torch.planning.femur import cut_out
+from femoreg_torch.planning.laws import Material
 from femoreg_torch.planning.loading import make_loading
 from femoreg_torch.planning.model import Bone, Model, make_bone, make_model, with_cement
 from femoreg_torch.planning.settings import Planning
@@ -34,10 +35,13 @@ class Prepared:
 
     def curve(self, cement: Array | None = None) -> Curve:
         """The curve of the femur with cement as shares (X, Y, Z) of the voxels' pores, or without."""
-        material = self.model.material
-        if cement is not None and cement.any():
-            material = with_cement(self.model, self.bone, cement, self.planning.cement)
-        return self.press.curve(material, self.planning.curve)
+        return self.press.curve(self.material(cement), self.planning.curve)
+
+    def material(self, cement: Array | None) -> Material:
+        """Of the elements with that cement, or without."""
+        if cement is None or not cement.any():
+            return self.model.material
+        return with_cement(self.model, self.bone, cement, self.planning.cement)
 
     def on_elements(self, size_mm: float) -> "Prepared":
         """The same femur on elements of another size. Raises `InputError` if they are too many."""
