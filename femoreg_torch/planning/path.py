@@ -185,20 +185,22 @@ def covered(
 ) -> tuple[Array, Array, float]:
     """Which places (N,) a volume of cement in ellipsoids fills, which ellipsoid each is of, and the axes' scale.
 
-    `middles` (K, 3) and `axes` (K, 2), along and across, are scaled together until just the volume is in the marrow.
+    `middles` (K, 3) lie on one line along the path. `axes` (K, 2), along and across, are scaled together until just the
+    volume is in the marrow.
     """
-    offset = worth.points[:, None] - middles
+    offset = worth.points - middles[0]
     along = offset @ path_direction
-    across = np.maximum((offset**2).sum(-1) - along**2, 0)
-    level = np.sqrt((along / axes[:, 0]) ** 2 + across / axes[:, 1] ** 2)
-    nearest = level.argmin(1)
-    least = level.min(1)
-    order = np.argsort(least, kind="stable")
+    across = np.maximum(np.einsum("ni,ni->n", offset, offset) - along**2, 0)  # squared, from the line
+    beside = along - ((middles - middles[0]) @ path_direction)[:, None]
+    squared = (beside / axes[:, :1]) ** 2 + across / axes[:, 1:] ** 2  # (K, N)
+    nearest = squared.argmin(0)
+    least = squared.min(0)
+    order = np.argsort(least)
     sums = np.cumsum(worth.room_ml[order])
     last = min(int(np.searchsorted(sums, volume_ml)), len(order) - 1)
     filled = np.zeros(len(order), bool)
     filled[order[: last + 1]] = True
-    return filled, nearest, float(least[order[last]])
+    return filled, nearest, math.sqrt(least[order[last]])
 
 
 def apart_mm(ellipsoids: Sequence[Ellipsoid]) -> float:

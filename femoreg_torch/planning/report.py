@@ -55,7 +55,8 @@ def plan_content(case: Case, prepared: Prepared, plan: FemoroplastyPlan, seed: i
         "elements": len(prepared.model.mesh.elements),
         "baseline": curve_content(plan.baseline),
         "optimum": curve_content(plan.optimum_curve) | {"gain": plan.optimum_gain, "loads_n": plan.optimum.loads_n},
-        "planned": curve_content(plan.curve) | {"gain": plan.gain, "tried_n": plan.tried_n},
+        "planned": curve_content(plan.curve)
+        | {"gain": plan.gain, "tried_n": plan.tried_n, "compared_n": plan.compared_n},
         "frame": {
             "head": femur.frame.head,
             "head_radius": femur.frame.head_radius,

@@ -58,16 +58,16 @@ class MeshSettings:
     """Hexahedra over the bone."""
 
     size_mm: float
-    optimum_mm: float
+    search_mm: float
     least_fill: float
     shaft_mm: float
     most_elements: int
 
     def __post_init__(self) -> None:
         _positive("mesh", size_mm=self.size_mm, shaft_mm=self.shaft_mm, most_elements=self.most_elements)
-        if self.optimum_mm < self.size_mm:
+        if self.search_mm < self.size_mm:
             raise InputError(
-                f"mesh.optimum_mm: at least mesh.size_mm, {self.size_mm:g}, was expected, found {self.optimum_mm:g}."
+                f"mesh.search_mm: at least mesh.size_mm, {self.size_mm:g}, was expected, found {self.search_mm:g}."
             )
         if not 0 < self.least_fill <= 1:
             raise InputError(f"mesh.least_fill: above 0 and up to 1 was expected, found {self.least_fill:g}.")
@@ -156,6 +156,8 @@ class PathSettings:
     most_axis_mm: float
     evaluations: int
     polish: int
+    compared: int
+    fine: int
 
     def __post_init__(self) -> None:
         _positive(
@@ -163,7 +165,10 @@ class PathSettings:
             ellipsoids=self.ellipsoids,
             least_axis_mm=self.least_axis_mm,
             evaluations=self.evaluations,
+            compared=self.compared,
         )
+        if min(self.polish, self.fine) < 0:
+            raise InputError(f"path: polish and fine of 0 or more were expected, found {self.polish} and {self.fine}.")
         if self.most_axis_mm <= self.least_axis_mm:
             raise InputError("path.most_axis_mm: more than least_axis_mm was expected.")
 

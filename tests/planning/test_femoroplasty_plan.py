@@ -44,9 +44,9 @@ from femoreg_torch.volume import Volume, read_ct, read_label_map, write_landmark
 
 PRESET = """extends: default
 calibration: {kind: uncalibrated}
-mesh: {size_mm: 6, optimum_mm: 7}
+mesh: {size_mm: 6, search_mm: 7}
 distribution: {steps: 2}
-path: {evaluations: 360, polish: 1, lowest_entry_mm: 70, clearance_mm: 4}
+path: {evaluations: 360, polish: 1, compared: 1, fine: 1, lowest_entry_mm: 70, clearance_mm: 4}
 diffusion: {voxel_mm: 3}
 offsets: {distance_mm: 4}
 """
@@ -103,13 +103,16 @@ def test_no_cement_no_gain_and_cement_gains(prepared: Prepared, plan: Femoroplas
     assert plan.optimum.loads_n[0] < plan.optimum.loads_n[1] < plan.optimum.loads_n[2]
 
 
-def test_paths_are_sought_on_finer_elements_than_the_optimum(prepared: Prepared, plan: FemoroplastyPlan) -> None:
+def test_loads_are_told_by_finer_elements_than_those_of_the_first_search(
+    prepared: Prepared, plan: FemoroplastyPlan
+) -> None:
     coarse = prepared.on_elements(7.0)
     assert len(prepared.model.mesh.elements) > len(coarse.model.mesh.elements)
     assert plan.optimum.baseline.yield_load_n == coarse.curve().yield_load_n != plan.baseline.yield_load_n
     assert plan.optimum_curve.yield_load_n == prepared.curve(plan.optimum.cement).yield_load_n
-    assert len(plan.tried_n) == 2
-    assert plan.curve.yield_load_n == max(plan.tried_n) == prepared.curve(plan.cement).yield_load_n
+    assert len(plan.tried_n) == 2  # the first and one anew
+    assert len(plan.compared_n) == 2  # the better of them, and one sought on finer elements
+    assert plan.curve.yield_load_n == max(plan.compared_n) == prepared.curve(plan.cement).yield_load_n
 
 
 def test_the_cement_is_as_much_as_was_asked_and_in_the_marrow(prepared: Prepared, plan: FemoroplastyPlan) -> None:
@@ -163,7 +166,7 @@ def test_the_path_keeps_its_limits(prepared: Prepared, plan: FemoroplastyPlan) -
 
 
 def planner(prepared: Prepared, plan: FemoroplastyPlan, **limits: Any) -> Planner:
-    searched = prepared.on_elements(prepared.planning.mesh.optimum_mm)
+    searched = prepared.on_elements(prepared.planning.mesh.search_mm)
     worth = places(prepared.bone, searched.model, plan.optimum.mechanisms, prepared.planning.cement)
     return Planner(Surroundings(prepared.bone), worth, ML, dataclasses.replace(prepared.planning.path, **limits))
 

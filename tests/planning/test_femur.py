@@ -283,10 +283,13 @@ def test_uncalibrated_says_so(solids: Solids) -> None:
 def test_presets_are_checked(tmp_path: Path) -> None:
     path = tmp_path / "own.yaml"
     path.write_text("extends: default\nmesh: {size_mm: 4}\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"mesh\.optimum_mm: at least mesh\.size_mm, 4, was expected, found 3"):
+    with pytest.raises(InputError, match=r"mesh\.search_mm: at least mesh\.size_mm, 4, was expected, found 3"):
         load_planning(path)
     path.write_text("extends: default\nmesh: {size_mm: -3}\n", encoding="utf-8")
     with pytest.raises(InputError, match="size_mm"):
+        load_planning(path)
+    path.write_text("extends: default\npath: {polish: -1}\n", encoding="utf-8")
+    with pytest.raises(InputError, match="path: polish and fine of 0 or more were expected, found -1 and 2"):
         load_planning(path)
     path.write_text("extends: default\nmesh: {sise_mm: 3}\n", encoding="utf-8")
     with pytest.raises(InputError, match="sise_mm"):
