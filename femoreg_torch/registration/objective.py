@@ -22,7 +22,7 @@ from femoreg_torch.registration.imaging import (
 from femoreg_torch.registration.intrinsics import PRIOR_WEIGHT, Intrinsics
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.scene import Body, Kind, Moving, RigidObject, Scene, split
-from femoreg_torch.registration.weights import Weighting, pixel_weights, prepared
+from femoreg_torch.registration.weights import Weighting, believed, pixel_weights, prepared
 from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import FixedSimilarity, Similarity, similarity_quadratics
 from femoreg_torch.volume import Volume
@@ -89,8 +89,11 @@ def _target(
         background = draw([scene.objects[name] for name in still], where, camera, level.step_mm)[0]
     placing = [name for body in rigid for name in body.objects]
     looked_at = pixel_weights(scene, poses, render, placing, image, camera, level.step_mm, weights)
-    fixed = prepared(scene, image, level, similarity, looked_at)
     imaging = imaging.as_seen(scene.scatter)
+    sure = believed(scene, poses, render, image, camera, level.step_mm, imaging)
+    if sure is not None:
+        looked_at = sure if looked_at is None else looked_at * sure
+    fixed = prepared(scene, image, level, similarity, looked_at)
     tissue = None
     if imaging.tissue and scene.tissue is not None:
         tissue = imaging.tissue * tissue_integrals(scene.tissue, poses.camera_from(scene.anchor)[view], camera)

@@ -1,4 +1,4 @@
-"""Pixel weights of an image: which pixels a stage's similarity looks at."""
+"""Pixel weights of an image: which pixels a stage's similarity looks at, and how far it believes what is drawn."""
 
 import math
 from collections.abc import Sequence
@@ -12,9 +12,10 @@ from torch.nn import functional as F
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, Poses, project_points
+from femoreg_torch.registration.imaging import Imaging, draw, hardened_slope
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.scene import Kind, Scene, Segmentation
-from femoreg_torch.similarity import FixedSimilarity, Similarity, against_field
+from femoreg_torch.similarity import FixedSimilarity, Similarity, against_field, derivative_taps, image_gradients
 
 # bones: the objects that the stage draws, where the network sees them. What the network does not know (an instrument)
 # counts where it is drawn at its present pose.
@@ -28,6 +29,11 @@ _BONE_MARGIN_MM = 10.0
 _SHADOW_MARGIN_MM = 3.0
 _LEAST_PROBABILITY = 0.5
 _LEAST_SHADOW = 0.02  # line integral: two per cent of the beam
+# How much an edge that may be a mistake counts against one that is drawn. Five simulated devices of several materials
+# ended 0.20° off with 0, 0.15° with 1, 0.14° with 5 and with 25.
+_MISTAKES = 10.0
+_PATCH_RADIUS, _SMOOTHING_PX = 5, 1.1  # of Grad-NCC, in all presets
+_FLAT = 1e-12  # squared change of a line integral per pixel
 
 
 def pixel_weights(
@@ -61,6 +67,50 @@ def pixel_weights(
             f"{', '.join(render)}? Otherwise take `weights` out of the stage."
         )
     return looked_at.float()
+
+
+def believed(
+    scene: Scene,
+    poses: Poses,
+    render: Sequence[str],
+    image: tuple[Kind, int],
+    camera: Camera,
+    step_mm: float,
+    imaging: Imaging,
+) -> Tensor | None:
+    """Weights (H, W), 0 to 1, of an image (kind, view): lower where what is drawn may be wrong; None where all is sure.
+
+    Where the materials of an object were estimated, a block at the border of two may be drawn as the wrong one. That
+    draws edges which the image does not have, and a strong one outweighs the faint true ones of its patch. With g² the
+    squared derivatives of what is drawn, and u² those of what is `unsure`, both summed over a patch, the patch weighs
+    g² / (g² + 10 u²).
+    """
+    kind, view = image
+    names = scene.shown(render, kind)
+    unsure = [name for name in names if scene.objects[name].unsure]
+    if not unsure:
+        return None
+    where = dict(zip(names, (poses.camera_from(name)[view][None, None] for name in names), strict=True))
+    alone = {name: draw([scene.objects[name]], pose, camera, step_mm)[0] for name, pose in where.items()}
+    drawn = torch.stack(list(alone.values())).sum(0)
+    slope = imaging.slope(drawn)
+    mistakes = torch.zeros_like(drawn)
+    for name in unsure:
+        seen = slope * hardened_slope(alone[name], scene.objects[name].hardening)
+        for difference in scene.objects[name].unsure:
+            mistakes += _edges(seen * project([difference], where[name], camera, step_mm)[0])
+    edges, mistakes = (_over_patches(of) for of in (_edges(imaging.image(drawn)), mistakes))
+    return (edges + _FLAT) / (edges + _MISTAKES * mistakes + _FLAT)
+
+
+def _edges(image: Tensor) -> Tensor:
+    """Squared length (H, W) of the derivatives of an image (H, W)."""
+    return image_gradients(image[None], derivative_taps(_SMOOTHING_PX, image.device))[0].square().sum(0)
+
+
+def _over_patches(image: Tensor) -> Tensor:
+    """The mean (H, W) around each pixel of an image (H, W)."""
+    return F.avg_pool2d(image[None], 2 * _PATCH_RADIUS + 1, 1, _PATCH_RADIUS)[0]
 
 
 def prepared(

@@ -8,6 +8,7 @@ from femoreg_torch.similarity.interface import (
     SmoothFixedSimilarity,
     against_field,
 )
+from femoreg_torch.similarity.kernels import derivative_taps, image_gradients
 from femoreg_torch.similarity.kinds import read_similarity
 from femoreg_torch.similarity.ncc import Ncc
 from femoreg_torch.similarity.orientation import GradientOrientation
@@ -23,6 +24,8 @@ __all__ = [
     "Similarity",
     "SmoothFixedSimilarity",
     "against_field",
+    "derivative_taps",
+    "image_gradients",
     "read_similarity",
     "shift_correlation",
     "similarity_quadratic",

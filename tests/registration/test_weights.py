@@ -4,17 +4,20 @@ from dataclasses import replace
 
 import pytest
 import torch
-from registration_scenes import CARM, float64, line_integrals, make_scene, segmentations, true_poses
+from registration_scenes import CARM, REFERENCE_POINTS, float64, line_integrals, make_scene, segmentations, true_poses
 from torch import Tensor
 
 from femoreg_torch.detect import Detection
+from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import Camera
+from femoreg_torch.geometry import Camera, pose_difference
+from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs
-from femoreg_torch.registration.scene import Body, Scene, Segmentation
+from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.scene import Body, Scene, Segmentation, moved
 from femoreg_torch.registration.start import with_segmentations
-from femoreg_torch.registration.weights import Weighting, pixel_weights
+from femoreg_torch.registration.weights import Weighting, believed, pixel_weights
 from femoreg_torch.similarity import GradNcc
 
 TRUTH = true_poses()
@@ -143,3 +146,51 @@ def test_the_network_looks_once_at_every_view(scene: Scene) -> None:
     seen = with_segmentations(scene, detection(0.0), find).segmentations
     assert [float(found.probabilities.mean()) for found in seen] == [0, 1, 2]
     assert all(image is other for image, other in zip(looks, scene.images["anatomy"][1:], strict=True))
+
+
+def with_a_mistake(scene: Scene, unsure: bool) -> Scene:
+    """A block of the device drawn thrice as dense as it is, which is known as a possible mistake, or not."""
+    device = scene.objects["device"]
+    block = torch.zeros_like(device.volume.data)
+    block[:, :, 16:22] = 2 * device.volume.data[:, :, 16:22]
+    mistaken = replace(device, volume=device.volume.with_data(device.volume.data + block))
+    difference = (device.volume.with_data(block),) if unsure else ()
+    return replace(scene, objects=scene.objects | {"device": replace(mistaken, unsure=difference)})
+
+
+def test_what_may_be_drawn_wrong_counts_less_and_all_else_as_before(scene: Scene) -> None:
+    """By the derivatives of a false block that float64 differences give, in the image and beside it."""
+    assert believed(scene, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, PLAIN) is None
+    unsure = with_a_mistake(scene, unsure=True)
+    assert believed(unsure, TRUTH, ALL, ("anatomy", 1), CARM.camera, 1.0, PLAIN) is None
+    weights = believed(unsure, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, PLAIN)
+    assert weights is not None
+    assert weights.min() >= 0
+    assert weights.max() <= 1
+    block = unsure.objects["device"].unsure[0]
+    pose = TRUTH.camera_from("device")[1]
+    false = project([block], pose[None, None], CARM.camera, 1.0)[0]
+    assert weights[false > 0.05].median() < 0.25
+    beside = distance(false > 1e-4) > 8 * CARM.camera.pixel_mm[0]  # a patch and the derivative's taps
+    assert weights[beside].min() > 0.999
+
+
+def test_a_device_with_a_part_drawn_wrong_is_placed_better_where_that_is_known(scene: Scene) -> None:
+    body = Body(("device",), 0, TRUTH.camera1_from["device"][:3, 3], float64(0.02, 0.02, 0.02, 1, 1, 4))
+    images = [("device", view) for view in range(3)]
+    ends = []
+    for unsure in (False, True):
+        drawn = with_a_mistake(scene, unsure)
+        costs = image_costs(drawn, TRUTH, (body,), ALL, images, Level(3.0, 1.0), GradNcc())
+        found = LevenbergMarquardt(max_iterations=20).minimise(stage_objective(costs, (body,), None), 6, 0)
+        ends.append(
+            pose_difference(
+                moved(TRUTH, (body,), found.delta).camera1_from["device"],
+                TRUTH.camera1_from["device"],
+                REFERENCE_POINTS["device"],
+            )
+        )
+    (blind_deg, blind_mm), (deg, mm) = ends
+    assert blind_deg > 0.3  # the mistake matters
+    assert deg < 0.7 * blind_deg
+    assert mm < blind_mm
