@@ -16,6 +16,8 @@ from femoreg_torch.planning.prepare import Prepared
 
 _LEAST_SPAN_POINTS = 4.0  # of an axis of gains: smaller differences lie within the error of the mesh
 _PLANES = ("sagittal", "coronal", "axial")  # by the index axis square to them
+_AXES = ("R ← mm → L", "A ← mm → P", "mm → head")  # along the index axes
+_BESIDE_MM = 8.0  # shown around the bone that is modelled
 
 
 def save(figure: Figure, path: File) -> None:
@@ -38,15 +40,20 @@ def curves_figure(curves: Mapping[str, Curve]) -> Figure:
 
 
 def overlay_figure(prepared: Prepared, plan: FemoroplastyPlan) -> Figure:
-    """Three planes through the middle of the cement: CT, cement (filled), optimum (outline) and path (projected)."""
+    """Three planes through the middle of the cement: CT, cement (filled), optimum (outline) and path (projected).
+
+    They show the part of the femur that is modelled. In the axial plane the front is at the top, as in other viewers.
+    """
     femur = prepared.bone.femur
     weight = plan.cement * prepared.bone.pores
     middle = np.round((np.argwhere(weight > 0) * weight[weight > 0][:, None]).sum(0) / weight.sum()).astype(int)
     ends = femur.index(np.stack([plan.path.entry, plan.path.target]))
-    figure = Figure(figsize=(14, 5.5), layout="constrained")
-    names = ("R ← mm → L", "A ← mm → P", "mm → head")
-    edges = np.array(femur.mask.shape) * femur.spacing
-    panels = figure.subplots(1, 3, width_ratios=(edges[1], edges[0], edges[0]))
+    modelled = np.argwhere(prepared.model.voxels)
+    edges = np.stack([modelled.min(0), modelled.max(0) + 1]) * femur.spacing + [[-_BESIDE_MM], [_BESIDE_MM]]  # (2, 3)
+    edges = np.clip(edges, 0, np.array(femur.mask.shape) * femur.spacing)
+    wide = edges[1] - edges[0]
+    figure = Figure(figsize=(14, 6), layout="compressed")
+    panels = figure.subplots(1, 3, width_ratios=(wide[1] / wide[2], wide[0] / wide[2], wide[0] / wide[1]))
     for normal, (axis, plane) in enumerate(zip(panels, _PLANES, strict=True)):
         across = [n for n in range(3) if n != normal]
         cut = tuple(middle[normal] if n == normal else slice(None) for n in range(3))
@@ -60,10 +67,13 @@ def overlay_figure(prepared: Prepared, plan: FemoroplastyPlan) -> Figure:
         line = (ends[:, across] + 0.5) * femur.spacing[across]
         axis.plot(*line.T, "-", color="lime", linewidth=2)
         axis.plot(*line[0], "o", color="lime")
-        axis.set(title=plane, xlabel=names[across[0]], ylabel=names[across[1]])
+        upwards = edges[:, across[1]] if plane != "axial" else edges[::-1, across[1]]
+        axis.set(title=plane, xlim=edges[:, across[0]], ylim=upwards, facecolor="black")
+        axis.set(xlabel=_AXES[across[0]], ylabel=_AXES[across[1]] if plane != "axial" else "P ← mm → A")
     figure.suptitle(
-        f"cement as planned (filled), free optimum (blue), path (green; dot: entry point) — {plan.volume_ml:g} ml, "
-        f"yield load {100 * plan.gain:+.0f} % (optimum {100 * plan.optimum_gain:+.0f} %), modelled"
+        "cement as planned (filled), free optimum (blue), path (green, projected; dot: entry point) — "
+        f"{plan.volume_ml:g} ml, yield load {100 * plan.gain:+.0f} % (optimum {100 * plan.optimum_gain:+.0f} %), "
+        "modelled"
     )
     return figure
 
@@ -77,7 +87,7 @@ def offsets_figure(outcomes: Mapping[str, Outcome], baseline_n: float, planned_n
     axis.tick_params(axis="x", rotation=30)
     axis.axhline(100 * (planned_n / baseline_n - 1), color="#c0602b", label="as planned")
     axis.set(ylabel="gain of yield load, %", title="Plan carried out beside its place, modelled")
-    axis.legend(loc="lower right")
+    figure.legend(loc="outside lower right")
     return figure
 
 

@@ -4,10 +4,9 @@ Every number is kept in a file of its own as soon as it is there, so that a run 
 """
 
 import os
-import resource
 import subprocess
 import sys
-import time
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -43,6 +42,17 @@ LAWS: tuple[tuple[Literal["fall", "stance"], Literal["keyak", "morgan"]], ...] =
 )
 _GENERIC, _MESHES, _COST, _OUTCOMES, _LAWS = "generic", "meshes.json", "cost.json", "outcomes.json", "laws.json"
 _ROBUSTNESS, _PRESET = "robustness.json", "preset.yaml"
+_BETWEEN = """
+import json, resource, subprocess, sys, time
+
+began = time.perf_counter()
+status = subprocess.call(sys.argv[2:])
+wall, used = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+cost = {"wall_s": wall, "processor_s": used.ru_utime + used.ru_stime, "peak_gb": used.ru_maxrss / 2**20}
+with open(sys.argv[1], "w", encoding="utf-8") as file:
+    json.dump(cost, file)
+sys.exit(status)
+"""
 
 
 @dataclass(frozen=True)
@@ -88,11 +98,19 @@ def _timed_plan(case: Path, plan: Path, preset: Path) -> dict[str, Any]:
     """Run `femoreg plan` as a user does, and what it cost."""
     words = ["plan", str(case), "--out", str(plan), "--volume-ml", str(VOLUME_ML), "--seed", str(_SEED)]
     words += ["--preset", str(preset)]
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    subprocess.run([sys.executable, "-m", "femoreg_torch.commands.main", *words], check=True)
-    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {"wall_s": wall, "processor_s": used, "peak_gb": after.ru_maxrss / 2**20, "cores": os.cpu_count()}
+    return cost_of([sys.executable, "-m", "femoreg_torch.commands.main", *words]) | {"cores": os.cpu_count()}
+
+
+def cost_of(command: Sequence[str]) -> dict[str, float]:
+    """Run a command; its wall and processor time, s, and its peak of memory, GB. Raises what `subprocess.run` does.
+
+    A small process stands between: Linux counts a process's memory from before it became the command, and before that
+    it is a copy of the one that started it, which is larger than a plan once it has computed fine meshes itself.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        told = Path(folder) / "cost.json"
+        subprocess.run([sys.executable, "-c", _BETWEEN, str(told), *command], check=True)
+        return dict(read_json(told))
 
 
 def _outcomes(folder: Path) -> None:

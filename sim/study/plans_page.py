@@ -175,7 +175,7 @@ def _meshes(all_found: Sequence[Measured], figure: str) -> str:
     ]
     header = (
         *("femur", "elements", "number", "bare, N", "against finest", "gain", "points"),
-        "processor time of a curve, s",
+        "processor time of a curve to its yield, s",
     )
     told = f"**Meshes**, the planned cement. Wanted: {_LOAD_PERCENT:g} % of the load and {_GAIN_POINTS:g} points of the"
     return "\n\n".join(

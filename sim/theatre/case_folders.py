@@ -12,9 +12,10 @@ import torch
 
 from femoreg_torch.case import View, new_folder, read_case, write_case
 from femoreg_torch.case.femoroplasty import ANATOMY_IMAGES, DEVICE_IMAGES, with_device
-from femoreg_torch.case.model import Side
+from femoreg_torch.case.model import PlannedPath, Side
 from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError
+from femoreg_torch.evaluation.report.planning import FIGURES
 from femoreg_torch.fluoro import write_image
 from femoreg_torch.volume import Volume, label_box_centre, read_ct, read_label_map, read_labels, read_mesh
 from sim.patient import Patient, make_patient, make_scans, write_patient
@@ -161,14 +162,26 @@ def check_same_patient(labels: Volume, finer: Volume, femur: tuple[int, ...]) ->
 
 
 def copied(known: Preoperative, folder: Path) -> Preoperative:
-    """The same with its volumes and its device in `folder`; volumes are linked where the file system can."""
+    """The same with volumes, device and the file of its plan in `folder`; volumes are linked where that can be done."""
     ct_path, labels_path = (_linked(path, folder) for path in (known.ct_path, known.labels_path))
     model_path = folder / f"device{known.device.model.path.suffix}"
     if known.device.model.path != model_path:
         shutil.copyfile(known.device.model.path, model_path)
     device = replace(known.device, model=replace(known.device.model, path=model_path))
-    case = replace(with_device(known.case, device), folder=folder, ct_path=ct_path, labels_path=labels_path)
+    plan = _plan_copied(known.case.plan, folder / "plan")
+    case = replace(with_device(known.case, device), folder=folder, ct_path=ct_path, labels_path=labels_path, plan=plan)
     return replace(known, case=case, ct_path=ct_path, labels_path=labels_path, device=device)
+
+
+def _plan_copied(plan: PlannedPath | None, folder: Path) -> PlannedPath | None:
+    """The same with the plan.json that it is from, and the pictures that a report shows of it, in a new `folder`."""
+    if plan is None or plan.file is None:
+        return plan
+    folder.mkdir()
+    for name in (plan.file.name, *(name for name, _ in FIGURES)):
+        if (plan.file.parent / name).is_file():
+            shutil.copyfile(plan.file.parent / name, folder / name)
+    return replace(plan, file=folder / plan.file.name)
 
 
 def _linked(path: Path, folder: Path) -> Path:

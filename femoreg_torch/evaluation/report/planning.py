@@ -6,7 +6,8 @@ from femoreg_torch.evaluation.report.parts import Material, Section, Table
 from femoreg_torch.files import read_json
 from femoreg_torch.planning.quote import quoted_gain, response_of
 
-_FIGURES = (("overlay.png", "Cement, free optimum and path in three planes."), ("curves.png", "Modelled loads."))
+# Pictures beside a plan.json, and what is written below them.
+FIGURES = (("overlay.png", "Cement, free optimum and path in three planes."), ("curves.png", "Modelled loads."))
 _LOADS = ("femur", "modelled yield load, N", "gain")
 _INJECTIONS = ("depth from the entry point, mm", "semi-axis along, mm", "semi-axis across, mm", "ml", "minutes")
 
@@ -34,7 +35,7 @@ def planning(material: Material) -> Section | None:
         for entry in content.get("injections", [])
     ]
     tables = [Table(_LOADS, rows, "Modelled loads"), Table(_INJECTIONS, injections, "Injections, from deep to shallow")]
-    files = [(case.plan.file.parent / name, caption) for name, caption in _FIGURES]
+    files = [(case.plan.file.parent / name, caption) for name, caption in FIGURES]
     figures = [
         {"png": base64.b64encode(file.read_bytes()).decode("ascii"), "caption": caption}
         for file, caption in files

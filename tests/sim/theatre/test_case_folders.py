@@ -13,6 +13,7 @@ from femoreg_torch.anatomy import label_table
 from femoreg_torch.case import read_case, write_case
 from femoreg_torch.case.femoroplasty import device_of
 from femoreg_torch.errors import InputError
+from femoreg_torch.files import read_json, write_json
 from femoreg_torch.fluoro import attenuation_image, read_image
 from femoreg_torch.volume import Volume, read_ct, read_labels, read_mesh, write_volume
 from sim.commands import phantom, simulate
@@ -82,6 +83,25 @@ def test_the_other_hip_gets_a_plan_of_its_own(patient, tmp_path):
     case = read_case(tmp_path / "left")
     assert case.side == "left"
     assert case.plan.entry_point[0] > case.landmarks["FH-l"][0]
+
+
+def test_the_file_of_a_plan_goes_with_the_case(patient, tmp_path):
+    """A report finds loads and pictures of the plan, wherever the case is taken."""
+    planned, given = tmp_path / "planned", read_case(patient)
+    planned.mkdir()
+    points = {"entry_point": given.plan.entry_point.tolist(), "target": given.landmarks["FH-r"].tolist()}
+    write_json(planned / "plan.json", {"side": "right", "plan": points, "planned": {"gain": 0.4}})
+    (planned / "overlay.png").write_bytes(b"picture")
+    before = tmp_path / "patient"
+    shutil.copytree(patient, before)
+    write_case(before, replace(read_case(before), plan=replace(given.plan, file=planned / "plan.json")))
+    simulate(before, out=tmp_path / "deep" / "case", seed=5)
+    shutil.move(tmp_path / "deep" / "case", tmp_path / "moved")
+    shutil.rmtree(planned)
+    plan = read_case(tmp_path / "moved").plan
+    assert plan.entry_point.tolist() == pytest.approx(points["entry_point"])
+    assert read_json(plan.file)["planned"] == {"gain": 0.4}
+    assert (plan.file.parent / "overlay.png").read_bytes() == b"picture"
 
 
 def test_every_step_is_reported(patient, tmp_path):
