@@ -38,7 +38,7 @@ from femoreg_torch.registration.shadows import (
 from femoreg_torch.volume import Volume
 
 _START_ATTENUATION = 0.2  # 1/mm: titanium at 80 keV
-_FEWEST_ROUNDS, _MOST_ROUNDS = 2, 4  # for blocks, and again for materials
+_FEWEST_ROUNDS, _MOST_ROUNDS = 2, 12  # for blocks, and again for materials; most are still after three or four
 _STILL = np.array([0.25] * 3 + [0.15] * 3)  # units of the pose: a round that moves it less is the last
 _ITERATIONS, _FEWER = 200, 40  # of L-BFGS from nothing, and from the round before
 _AS_NAMED = 0.3  # logarithm: one material so near to what the case names is that

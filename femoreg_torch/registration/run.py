@@ -117,21 +117,26 @@ def register_scene(
 
     `follow` is told the poses after every optimisation, and those at the start.
     """
-    plan = plan if isinstance(plan, Plan) else load_plan(plan)
     clock = {"began": time.perf_counter()}
     report("reading CT and images", 0.0)
     starts = {name: thing.start for name, thing in case.objects.items()}
     if scene is not None:
         starts = {name: thing.start for name, thing in scene.objects.items()}
     placed = [name for name, begin in starts.items() if begin.by_landmarks and name not in (start or {})]
-    looks = plan.needs_segmentations or (bool(placed) and landmarks is None)
-    with ThreadPoolExecutor(max_workers=2) as beside:  # network and kernels are loaded while the CT is read
-        network = kernels = None
+    with ThreadPoolExecutor(max_workers=3) as beside:  # preset, network and kernels are read while the CT is
+        network = kernels = reading = None
+        if scene is None:
+            reading = beside.submit(prepare_scene, case)
         if device.type == "cpu":
             kernels = beside.submit(load_kernels)
+        plan = plan if isinstance(plan, Plan) else load_plan(plan)
+        looks = plan.needs_segmentations or (bool(placed) and landmarks is None)
         if looks and find is None and case.anatomy is not None:
             network = beside.submit(network_detector, case, None, device)
-        scene = (prepare_scene(case) if scene is None else scene).to(device)
+    if reading is not None:
+        scene = reading.result()
+    assert scene is not None  # given, or read
+    scene = scene.to(device)
     if kernels is not None:
         kernels.result()  # raises what went wrong there
     if start is not None:
