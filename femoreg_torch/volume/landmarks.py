@@ -17,6 +17,7 @@ from femoreg_torch.volume.grid import Volume
 
 _LPS_FROM = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
 _SPACES = {"0": "RAS", "1": "LPS", "RAS": "RAS", "LPS": "LPS"}  # numbers as in 3D Slicer before 4.11
+_LONGEST_NAME = 60  # characters of a point's name that a message repeats as they are
 _FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
 
 
@@ -112,11 +113,16 @@ def read_landmarks(path: Path, known: Sequence[str] | None = HIP.landmark_names)
         if not name:
             raise InputError(f"{path}: unknown landmark {shortened(label)}.{told}")
         if name in found:
-            raise InputError(f"{path}: landmark {name} stands there twice. Keep one.")
+            raise InputError(f"{path}: landmark {_told(name)} stands there twice. Keep one.")
         found[name] = point
     if not found:
         raise InputError(f"{path}: holds no landmark.{told}")
     return {name: found[name] for name in (known or found) if name in found}
+
+
+def _told(name: str) -> str:
+    """A point's name for a message, shortened where nobody would have written it."""
+    return name if len(name) <= _LONGEST_NAME else shortened(name)
 
 
 def _plain_name(text: str) -> str:
@@ -136,7 +142,8 @@ def _points(path: Path) -> list[tuple[str, Tensor]]:
     for number, (space, label, value) in enumerate(points, 1):
         name = label if isinstance(label, str) else ""
         signs = torch.tensor(_signs(space, f"{path}, coordinate system"), dtype=torch.float64)
-        found.append((name, _point(value, f"{path}, {name or f'point {number} (no name)'}") * signs))
+        told = _told(name) if name else f"point {number} (no name)"
+        found.append((name, _point(value, f"{path}, {told}") * signs))
     return found
 
 
@@ -185,6 +192,6 @@ def check_inside(landmarks: Mapping[str, Tensor], volume: Volume) -> None:
         if (index < -0.5).any() or (index > size - 0.5).any():
             position = ", ".join(f"{v:.1f}" for v in point.tolist())
             raise InputError(
-                f"landmark {name} at ({position}) mm LPS lies outside the CT. Check for RAS/LPS mix-ups, or that both "
-                "files are of the same scan."
+                f"landmark {_told(name)} at ({position}) mm LPS lies outside the CT. Check for RAS/LPS mix-ups, or "
+                "that both files are of the same scan."
             )

@@ -194,3 +194,15 @@ def test_a_landmark_outside_the_ct_is_refused() -> None:
     for point in ([64.1, 10.0, 5.0], [3.9, 10.0, 5.0], [20.0, 10.0, -0.6]):
         with pytest.raises(InputError, match=r"FH-l .* outside the CT"):
             check_inside({"FH-l": torch.tensor(point, dtype=torch.float64)}, volume)
+
+
+def test_a_name_that_nobody_would_write_is_not_repeated_whole(tmp_path: Path) -> None:
+    """Found by the fuzz suite, seed 177: a line of 100,000 characters."""
+    name = "x" * 100_000
+    for point, times in (([1.0, 3.0], 1), ([1.0, 2.0, 3.0], 2)):
+        markup = {"coordinateSystem": "LPS", "controlPoints": [{"label": name, "position": point}] * times}
+        path = tmp_path / f"long{times}.mrk.json"
+        path.write_text(json.dumps({"markups": [markup]}), encoding="utf-8")
+        with pytest.raises(InputError) as told:
+            read_landmarks(path, known=None)
+        assert len(str(told.value)) < 300 + len(str(path))

@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.volume import read_mesh, voxelise_mesh
+from femoreg_torch.volume import check_closed, read_mesh, voxelise_mesh
 
 MU = 6000 * 2.6828e-5  # 5000 HU above air, 1/mm
 
@@ -105,3 +105,13 @@ def test_what_is_no_mesh_is_refused(tmp_path: Path, content: bytes) -> None:
         read_mesh(tmp_path / "device.stl")
     with pytest.raises(InputError, match="no such file"):
         read_mesh(tmp_path / "other.stl")
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_flat_mesh_encloses_nothing_and_a_thin_wire_something() -> None:
+    """A box without a width, closed as it is (fuzz, seed 177), and a wire of 0.1 mm and 300 mm."""
+    flat = trimesh.creation.box((0.0, 10.0, 60.0))
+    with pytest.raises(InputError, match=r"^model: the mesh is flat and encloses nothing\."):
+        check_closed(flat, "model")
+    wire = trimesh.creation.cylinder(radius=0.05, height=300.0)
+    assert check_closed(wire, "model") is wire
