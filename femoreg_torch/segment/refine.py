@@ -3,9 +3,9 @@
 The network says which bone lies where, to about a coarse voxel; in that band the CT decides. A voxel there is bone if
 it is brighter than a threshold between soft tissue and the brightest bone near it, as edges of a blurred plate lie at a
 part of its height (Prevrhal et al., Phys. Med. Biol. 44, 1999, of cortex in CT). A low threshold first, so that cortex
-has no gaps and encloses its marrow, which is kept by the network's share and by closing. Then a watershed along the
-crest of the cortex says what lies beyond it and what within, also where the network is wrong by a few millimetres; and
-last the edge itself.
+has no gaps and encloses its marrow, which is kept by the network's share and by closing. Then the crest of the cortex
+says what lies beyond it and what within (`crest`), also where the network is wrong by a few millimetres; and last the
+edge itself.
 """
 
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from femoreg_torch.anatomy import Anatomy
+from femoreg_torch.segment.boxes import Mask, radius
+from femoreg_torch.segment.crest import sides_of_the_crest
 from femoreg_torch.volume import Volume
-
-Mask = NDArray[np.bool_]
 
 _FINEST_MM = 1.0  # finer voxels are averaged; labels then lie within half a millimetre
 _MARGIN_MM = 9.0  # around what the network labels
@@ -32,11 +32,11 @@ _SOFT_HU = 50.0
 _WHOLE_SHARE, _LOWEST_WHOLE_HU, _HIGHEST_WHOLE_HU = 0.35, 130.0, 300.0
 _EDGE_SHARE, _LOWEST_EDGE_HU, _HIGHEST_EDGE_HU = 0.5, 130.0, 600.0
 _RIM_MM = 1.5  # depth of what is asked so, at least one voxel
-_SURELY_WITHIN_MM = (5.0, 3.5, 2.0)  # from the outline found first; the lesser ones in parts that are thinner
-_SURELY_BEYOND = 0.08  # share of all bones; what is less is no bone
-_WITHIN_SHARE = 0.3  # of all bones, which what lies within the crest must have
+_WITHIN_SHARE = 0.15  # of all bones, which what lies within the crest must have
 _BEYOND_MM = 4.5  # depth to which dark voxels beyond the crest are taken off, whatever the network says
-_CREST_MM = 0.7  # standard deviation of the blur that takes the noise off the crest
+_CHANNELLED = "sacrum"  # nerves run through it, in foramina
+_CHANNEL_MM = 12.0  # and so deep are they taken off there, from either end of a channel
+_WALL_SEEN_MM = 2.0  # the largest voxels, along two axes, on which the wall of a foramen is seen
 _NEAR_MM = 3.0
 _SOFTNESS_HU = 100.0  # about the threshold, over which the CT's evidence goes from −1 (no bone) to 1 (bone)
 _CT_WEIGHT = 0.35  # of the CT's evidence beside the network's share: 0.15 to 0.85 is the band where the CT decides
@@ -73,18 +73,24 @@ def refined_labels(ct: Volume, shares: Tensor, grid: Volume, anatomy: Anatomy) -
         return labels
     region = _region(ct, coarse > 0, grid)
     bone, which, joint = _on_region(shares, region, ct, grid, anatomy)
-    brightest = _largest_near(region.hu.clamp(-200, 1500), _radius(_NEAR_MM, region.spacing))
+    brightest = _largest_near(region.hu.clamp(-200, 1500), radius(_NEAR_MM, region.spacing))
     whole = _threshold(brightest, _WHOLE_SHARE, _LOWEST_WHOLE_HU, _HIGHEST_WHOLE_HU)
     found = torch.where(_is_bone(bone - _JOINT_WEIGHT * joint, region, whole), which, 0).numpy()
     for number in range(1, shares.shape[0]):
         found = _whole(found, number, bone.numpy(), region.spacing)
-    within, beyond = _sides_of_the_crest(found > 0, bone.numpy(), region)
-    found = np.where(within & (found == 0) & (bone > _WITHIN_SHARE).numpy(), which, found)
+    seen = np.sort(region.spacing)[1] <= _WALL_SEEN_MM
+    channelled = 1 + anatomy.bone_names.index(_CHANNELLED) if seen else 0
+    sides = sides_of_the_crest(found, bone.numpy(), region.hu.numpy(), region.spacing, channelled)
+    found = np.where((found == 0) & (bone > _WITHIN_SHARE).numpy(), sides.within, found)
     edge = _threshold(brightest, _EDGE_SHARE, _LOWEST_EDGE_HU, _HIGHEST_EDGE_HU)
     at_joint = joint > _JOINT_SHARE
-    dark = beyond & ((region.hu < edge) & ~_near_metal(region) & ~at_joint).numpy()
-    settled = (_is_bone(bone, region, edge) | at_joint).numpy() & ~dark
-    found = _trimmed(_trimmed(found, settled, _RIM_MM, region.spacing), ~dark, _BEYOND_MM, region.spacing)
+    may_go = ((region.hu < edge) & ~_near_metal(region) & ~at_joint).numpy()
+    dark = sides.beyond & may_go
+    settled = (_is_bone(bone, region, edge) | at_joint).numpy() & ~dark | (sides.within > 0)
+    found = _trimmed(found, settled, _RIM_MM, region.spacing)
+    channels = sides.clearly_beyond & may_go & (found == channelled)
+    without_channels = _trimmed(found, ~channels, _CHANNEL_MM, region.spacing)
+    found = np.minimum(_trimmed(found, ~dark, _BEYOND_MM, region.spacing), without_channels)
     found = opened_joints(found, region.hu.numpy(), region.spacing, anatomy)
     return _onto(labels, torch.from_numpy(found), region)
 
@@ -178,45 +184,14 @@ def _is_bone(bone: Tensor, region: _Region, threshold: Tensor) -> Tensor:
 
 def _near_metal(region: _Region) -> Tensor:
     metal = region.hu > _METAL_HU
-    return _largest_near(metal.float(), _radius(_METAL_MM, region.spacing)) > 0 if bool(metal.any()) else metal
-
-
-def _sides_of_the_crest(found: Mask, bone: NDArray[np.float32], region: _Region) -> tuple[Mask, Mask]:
-    """What lies within and what beyond the crest of the cortex, (Z, Y, X) each, around the outline `found` first.
-
-    A watershed of the CT, darkest first, from what is surely within and surely beyond (Meyer, Signal Processing 38,
-    1994): both rise to the crest, and where the cortex has a gap they meet in it.
-    """
-    sure = np.zeros(found.shape, np.uint8)
-    around = [2 * r + 1 for r in _radius(1.5 * _SURELY_WITHIN_MM[0], region.spacing)]
-    for depth_mm in _SURELY_WITHIN_MM:
-        size = [2 * r + 1 for r in _radius(depth_mm, region.spacing)]
-        sure |= ndimage.minimum_filter(found.astype(np.uint8), size) * (ndimage.maximum_filter(sure, around) == 0)
-    none = bone < _SURELY_BEYOND
-    # of either only the border, from which all else is reached
-    band = ~none & ~ndimage.binary_erosion(sure) | none & ndimage.binary_dilation(~none)
-    markers = np.where(sure > 0, 1, np.where(none, 2, 0)) * band
-    smooth = ndimage.gaussian_filter(region.hu.numpy(), _CREST_MM / region.spacing[::-1])
-    side = watershed(smooth, markers, mask=band)
-    # Where both meet is the crest itself, which its brightness judges. If it is no brighter than what lies within,
-    # there is no crest: such is the dense middle of a femoral head of which the network cut off the rest.
-    meeting = (side == 1) & ndimage.binary_dilation(side == 2)
-    crest = _mean_near(smooth, meeting, around) > _mean_near(smooth, sure > 0, around)
-    return (side == 1) & ~meeting, (side == 2) & crest
-
-
-def _mean_near(values: NDArray[np.float32], there: Mask, size: list[int]) -> NDArray[np.float32]:
-    """Mean in a box around each voxel of the values that are there; NaN without any."""
-    share = ndimage.uniform_filter(there.astype(np.float32), size, mode="constant")
-    total = ndimage.uniform_filter(values * there, size, mode="constant")
-    return np.where(share > 0.5 / np.prod(size), total, np.nan) / np.maximum(share, 1e-9)
+    return _largest_near(metal.float(), radius(_METAL_MM, region.spacing)) > 0 if bool(metal.any()) else metal
 
 
 def _trimmed(
     labels: NDArray[np.uint8], settled: Mask, depth_mm: float, spacing: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     """The labels, so deep from outside, without what is not `settled`, which keeps what lies behind it."""
-    layers = _radius(depth_mm, spacing)
+    layers = radius(depth_mm, spacing)
     outside, may_be = labels == 0, (labels == 0) | ~settled
     for n in range(max(layers)):
         step = ndimage.generate_binary_structure(3, 1)
@@ -225,12 +200,6 @@ def _trimmed(
                 step.swapaxes(0, axis)[[0, 2]] = False
         outside = ndimage.binary_dilation(outside, step, mask=may_be)
     return np.where(outside, 0, labels).astype(np.uint8)
-
-
-def _radius(mm: float, spacing: NDArray[np.float64]) -> tuple[int, int, int]:
-    """Voxels along z, y, x, at least one."""
-    x, y, z = (max(1, round(mm / float(s))) for s in spacing)
-    return z, y, x
 
 
 def _largest_near(values: Tensor, radius: tuple[int, int, int]) -> Tensor:
@@ -251,7 +220,7 @@ def _whole(
     box = ndimage.find_objects(labels == number, 1)[0]
     if box is None:
         return labels
-    room = _radius(_CLOSE_MM, spacing)
+    room = radius(_CLOSE_MM, spacing)
     box = tuple(slice(max(0, s.start - r - 1), s.stop + r + 1) for s, r in zip(box, room, strict=True))
     part, share = labels[box], bone[box]
     mask = part == number
@@ -288,7 +257,7 @@ def opened_joints(
     than around are freed.
     """
     result = labels.copy()
-    room = _radius(_SURE_MM, spacing)
+    room = radius(_SURE_MM, spacing)
     for side in ("left", "right"):
         femur, hip = (1 + anatomy.bone_names.index(f"{bone}_{side}") for bone in ("femur", "hip"))
         touching = contact(labels, femur, hip)
