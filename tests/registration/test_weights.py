@@ -159,7 +159,7 @@ def with_a_mistake(scene: Scene, unsure: bool) -> Scene:
 
 
 def test_what_may_be_drawn_wrong_counts_less_and_all_else_as_before(scene: Scene) -> None:
-    """By the derivatives of a false block that float64 differences give, in the image and beside it."""
+    """Little where a false block is drawn, and all where no patch reaches it."""
     assert believed(scene, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, PLAIN) is None
     unsure = with_a_mistake(scene, unsure=True)
     assert believed(unsure, TRUTH, ALL, ("anatomy", 1), CARM.camera, 1.0, PLAIN) is None
