@@ -16,7 +16,7 @@ from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
-from femoreg_torch.volume import Volume
+from femoreg_torch.volume import Volume, sharpened
 
 _LEVEL = Level(pixel_mm=3.1, step_mm=2.0)
 _SIMILARITY = GradNcc(patch_radius=5)
@@ -48,9 +48,10 @@ def handedness(scene: Scene, poses: Poses, name: str, imaging: Imaging) -> Hande
     body = Body((name,), 0, centre, torch.tensor(_SCALE, dtype=torch.float64))
     costs = image_costs(scene, poses, (body,), shown, images, _LEVEL, _SIMILARITY, imaging=imaging)
     as_it_is = float(costs(costs.still[None]).mean())
+    thing = scene.objects[name]
     mirrored = [
-        costs.with_object(name, replace(scene.objects[name], volume=volume))
-        for volume in mirror_images(_LEVEL.volume(scene.objects[name].volume))
+        costs.with_object(name, replace(thing, volume=sharpened(volume) if thing.sharp else volume))
+        for volume in mirror_images(_LEVEL.volume(thing.volume))
     ]
     nearest = min(mirrored, key=lambda candidate: float(candidate(candidate.still[None]).mean()))
     fitted = _OPTIMISER.minimise(stage_objective(nearest, (body,), None), len(costs.still), seed=0)

@@ -62,13 +62,16 @@ def hardened(integrals: Tensor, hardening: float) -> Tensor:
     The light that passes is the mean of exp(−a ℓ) over the spectrum. For attenuations a that are distributed as a gamma
     distribution, of which h is the squared coefficient of variation, that mean is (1 + h L)^(−1/h), with L of the mean
     attenuation (the distribution's Laplace transform). Thin metal thus takes more light per millimetre than thick.
+    Less than nothing, as beside the edges of sharpened volumes, stays what it is.
     """
-    return torch.log1p(hardening * integrals) / hardening if hardening else integrals
+    if not hardening:
+        return integrals
+    return torch.log1p(hardening * integrals.clamp_min(0)) / hardening + integrals.clamp_max(0)
 
 
 def hardened_slope(image: Tensor, hardening: float) -> Tensor:
     """The derivative of `hardened` by the integrals, 1 / (1 + h L), from what they came to."""
-    return (-hardening * image).exp()
+    return (-hardening * image.clamp_min(0)).exp()
 
 
 def draw(things: Sequence[RigidObject], placed: Tensor, camera: Camera, step_mm: float) -> Tensor:

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -11,11 +12,12 @@ from torch.nn import functional as F
 from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import Camera
 from femoreg_torch.settings import check_within
-from femoreg_torch.volume import Volume, changes_in_place, halved
+from femoreg_torch.volume import Volume, changes_in_place, halved, sharpened
 
 _ROUNDING_MM = 1e-6
-# Volumes on voxels twice as large, for later stages, and the version of the data that they were made of.
+# What was made of volumes, for later stages, and the version of the data that it was made of.
 _halves: WeakKeyDictionary[Volume, tuple[int, Volume]] = WeakKeyDictionary()
+_sharpened: WeakKeyDictionary[Volume, tuple[int, Volume]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True)
@@ -36,19 +38,29 @@ class Level:
         """An attenuation image (H, W) of the given camera with the pixels of this level."""
         return _binned(image, changes_in_place(image), binning(self.pixel_mm, camera))
 
-    def volume(self, volume: Volume) -> Volume:
-        """A volume with voxels as large as the steps of this level allow: its own, or twice, four times … as large."""
+    def volume(self, volume: Volume, *, sharp: bool = False) -> Volume:
+        """A volume with voxels as large as the steps of this level allow: its own, or twice, four times … as large.
+
+        With `sharp` it is as sharp as what its voxels are means of, see `sharpened`.
+        """
         if 2 * max(volume.spacing_mm) > self.step_mm + _ROUNDING_MM:
-            return volume
-        version, half = _halves.get(volume, (-1, volume))
-        if version != changes_in_place(volume.data):
-            half = halved(volume)
-            _halves[volume] = changes_in_place(volume.data), half
-        return self.volume(half)
+            return _made(sharpened, volume, _sharpened) if sharp else volume
+        return self.volume(_made(halved, volume, _halves), sharp=sharp)
 
     def field(self, exposed: Tensor, camera: Camera) -> Tensor:
         """The pixels of this level, bool, that lie wholly in a mask (H, W) of the given camera."""
         return F.max_pool2d((~exposed)[None].float(), binning(self.pixel_mm, camera))[0] == 0
+
+
+def _made(
+    make: Callable[[Volume], Volume], volume: Volume, known: WeakKeyDictionary[Volume, tuple[int, Volume]]
+) -> Volume:
+    """What is made of a volume, computed once (and again if its data were changed)."""
+    version, made = known.get(volume, (-1, volume))
+    if version != changes_in_place(volume.data):
+        made = make(volume)
+        known[volume] = changes_in_place(volume.data), made
+    return made
 
 
 @functools.lru_cache(maxsize=24)

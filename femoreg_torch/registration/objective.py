@@ -316,7 +316,10 @@ def image_costs(
     Objects of `render` that no body moves are drawn once and added. `weights` says which pixels count, see
     `pixel_weights`, by default all. Raises `InputError` for an image that they leave no pixel of.
     """
-    fitting = {name: replace(thing, volume=level.volume(thing.volume)) for name, thing in scene.objects.items()}
+    fitting = {
+        name: replace(thing, volume=level.volume(thing.volume, sharp=thing.sharp))
+        for name, thing in scene.objects.items()
+    }
     scene = replace(scene, objects=fitting)
 
     def target(image: tuple[Kind, int]) -> _Target:

@@ -90,6 +90,7 @@ def prepare_scene(case: Case) -> Scene:
             parts=volumes.parts,
             axis=round_axis(volumes.volume),
             materials_known=thing.model.materials_known,
+            sharp=bool(thing.model.solids),
         )
     known = case.views[-1].camera_from_camera1 is not None
     identity = torch.eye(4, dtype=torch.float64)

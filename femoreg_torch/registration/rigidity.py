@@ -144,7 +144,7 @@ def _cut(scene: Scene, poses: Poses, name: str, share: float, images: Sequence[t
     lower = _heights(volume, axis).to(data.device) < place
     parts = torch.where(lower, data, 0.0), torch.where(lower, 0.0, data)
     one, other = (
-        RigidObject(volume.with_data(part), of.mean(0), thing.shown_in, hardening=thing.hardening)
+        RigidObject(volume.with_data(part), of.mean(0), thing.shown_in, sharp=thing.sharp, hardening=thing.hardening)
         for part, of in zip(parts, both, strict=True)
     )
     near = (along - place).abs().argsort()[:least]

@@ -38,6 +38,7 @@ class RigidObject:
     parts: tuple[Volume, ...] = ()  # of a model, each of one material; on the grid of `volume`, which is their sum
     axis: Axis | None = None  # of a model that is round, as it was told
     materials_known: bool = False  # whether materials were named; the HU of a single solid may be a guess
+    sharp: bool = False  # whether it is made of solids with surfaces, over which its voxels average
     hardening: float = 0.0  # of the beam in it, see `registration.imaging.hardened`
     # differences of attenuation, 1/mm, of what was estimated: each comes in with an amount of mean 0 and variance 1
     unsure: tuple[Volume, ...] = ()

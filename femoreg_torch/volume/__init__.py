@@ -18,7 +18,7 @@ from femoreg_torch.volume.reading import (
     read_volume_told,
     write_volume,
 )
-from femoreg_torch.volume.resample import crop, halved, resample_isotropic
+from femoreg_torch.volume.resample import crop, halved, resample_isotropic, sharpened
 from femoreg_torch.volume.segments import has_names, segment_names
 from femoreg_torch.volume.sides import stray_landmarks, swapped_sides
 from femoreg_torch.volume.solids import Solid, solid_volumes
@@ -56,6 +56,7 @@ __all__ = [
     "resample_isotropic",
     "scanned_device",
     "segment_names",
+    "sharpened",
     "solid_volumes",
     "stray_landmarks",
     "structure_attenuation",

@@ -65,6 +65,22 @@ def resample_isotropic(volume: Volume, spacing_mm: float, nearest: bool = False)
     return Volume(_resize(volume.data, (scale[0], scale[1], scale[2]), nearest), affine)
 
 
+def sharpened(volume: Volume) -> Volume:
+    """A volume whose voxels hold means over themselves, so that between them it is as sharp as what they are means of.
+
+    The mean over a voxel of edge h (variance h² / 12 along each axis) and the interpolation between voxels (h² / 6)
+    blur by a variance of h² / 4. To the order of h², a blur of variance σ² adds σ² / 2 times the second derivative, so
+    that an eighth of the second differences is taken off. Beside edges the values overshoot. Zeros lie around the
+    volume.
+    """
+    data = volume.data
+    change = torch.zeros_like(data)
+    for axis in range(3):
+        around = F.pad(data.movedim(axis, -1), (1, 1))
+        change += (around[..., 2:] - 2 * around[..., 1:-1] + around[..., :-2]).movedim(-1, axis)
+    return volume.with_data(data - change / 8)
+
+
 def halved(volume: Volume) -> Volume:
     """The volume on voxels twice as large, each the mean of eight; what is missing at the far faces counts as zero."""
     data = F.pad(volume.data, [n for size in reversed(volume.data.shape) for n in (0, size % 2)])

@@ -8,11 +8,12 @@ import trimesh
 from torch import Tensor
 from torch.nn import functional as F
 
-from femoreg_torch.drr import project
+from femoreg_torch.drr import CPU, project
 from femoreg_torch.geometry import Camera
 from femoreg_torch.volume import Volume, hu_to_attenuation, voxelise_mesh
 from femoreg_torch.volume.materials import DENSITIES
 from sim.physics.materials import WATER_PER_BONE, metal_density
+from sim.physics.mesh_paths import mesh_paths
 
 _PIXEL_PER_VOXEL = 0.6  # mm on the detector; a voxel's shadow there is some 1.35 times as wide as the voxel
 _ASIDE = 2  # coarse pixels to each side that cubic interpolation needs
@@ -20,14 +21,15 @@ _ASIDE = 2  # coarse pixels to each side that cubic interpolation needs
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """Something in the beam that is no patient: its material (`femoreg_torch.volume.materials`) and its density."""
+    """Something in the beam that is no patient: a closed surface (mm), full of a material at its density in g/cm³."""
 
-    material: str
-    density: Volume  # g/cm³
+    material: str  # of `femoreg_torch.volume.materials`
+    mesh: trimesh.Trimesh
+    density: float
 
-    def to(self, device: torch.device) -> "Solid":
-        """The same with its density on a device."""
-        return replace(self, density=self.density.to(device))
+    def voxels(self, spacing_mm: float) -> Volume:
+        """The same in g/cm³ on cubic voxels."""
+        return _filled(self.mesh, spacing_mm, 1000.0, self.density)
 
 
 def areal_densities(
@@ -85,9 +87,9 @@ def device_density(mesh: trimesh.Trimesh, spacing_mm: float, hu: float) -> Volum
     return _filled(mesh, spacing_mm, hu, metal_density(hu))
 
 
-def solid_of(mesh: trimesh.Trimesh, material: str, spacing_mm: float) -> Solid:
+def solid_of(mesh: trimesh.Trimesh, material: str) -> Solid:
     """A closed mesh (mm) full of a material at its own density."""
-    return Solid(material, _filled(mesh, spacing_mm, 1000.0, DENSITIES[material]))
+    return Solid(material, mesh, DENSITIES[material])
 
 
 def _filled(mesh: trimesh.Trimesh, spacing_mm: float, hu: float, density: float) -> Volume:
@@ -98,14 +100,15 @@ def _filled(mesh: trimesh.Trimesh, spacing_mm: float, hu: float, density: float)
 
 
 def areal_solids(
-    solids: Sequence[Solid], camera_from_solids: Tensor, camera: Camera, step_mm: float
+    solids: Sequence[Solid], camera_from_solids: Tensor, camera: Camera, device: torch.device = CPU
 ) -> dict[str, Tensor]:
-    """Mass per area (H, W) in g/cm² of each material of solids that share one frame; pose (4, 4)."""
-    if not solids:
-        return {}
-    numbered = {str(number): solid.density for number, solid in enumerate(solids)}
-    images = areal_densities(numbered, camera_from_solids, camera, step_mm).values()
-    return together(*({solid.material: image} for solid, image in zip(solids, images, strict=True)))
+    """Mass per area (H, W) in g/cm² of each material of solids that share one frame; pose (4, 4). It lies on `device`.
+
+    From the surfaces themselves, not from voxels as registration draws them: a device is imaged as sharply as it is.
+    """
+    paths = (mesh_paths(solid.mesh, camera_from_solids, camera) for solid in solids)  # mm · g/cm³ to g/cm²
+    areal = ({solid.material: path * (solid.density / 10)} for solid, path in zip(solids, paths, strict=True))
+    return {material: mass.to(device) for material, mass in together(*areal).items()}
 
 
 def together(*areal: Mapping[str, Tensor]) -> dict[str, Tensor]:

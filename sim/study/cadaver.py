@@ -162,9 +162,7 @@ def _make_trial(study: CadaverStudy, specimen: Path, imaged: tuple[Volume, Volum
             return on_device.areal(camera_from_device, camera)
 
         metal = metal_in_beam(mesh, study.specimen, settings.acquisition)
-        images = view_images(
-            body, metal, procedure, camera, step_mm, settings.xray, generator, lambda _: None, on_device=fixed
-        )
+        images = view_images(body, metal, procedure, camera, settings.xray, generator, lambda _: None, on_device=fixed)
         known = _with_beaded_ct(known, in_femur, study.ct_blur_mm, folder)
         write_images_and_case(folder, known, images, procedure)
         noise = torch.randn(on_device.points.shape, generator=generator, dtype=torch.float64)

@@ -261,7 +261,7 @@ def image_views(
         return body.areal(pose, known, drawn, camera, step_mm)
 
     metal = metal_in_beam(read_mesh(known.device.model.path), body.device_seed, settings.acquisition)
-    return view_images(areal, metal, drawn, camera, step_mm, settings.xray, generator, lambda _: None)
+    return view_images(areal, metal, drawn, camera, settings.xray, generator, lambda _: None)
 
 
 def write_told(

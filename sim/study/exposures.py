@@ -27,7 +27,7 @@ from femoreg_torch.registration.scene import Scene
 from femoreg_torch.volume import Volume
 from sim.physics.beam import open_beam, shutter
 from sim.physics.fluoroscopy import XrayModel, photons_per_pixel, scattered, transmission
-from sim.physics.line_integrals import Solid, together
+from sim.physics.line_integrals import together
 from sim.physics.materials import WATER_PER_BONE
 from sim.study.information import Information, image_information
 from sim.study.responses import centres_in, view_block
@@ -69,7 +69,7 @@ class Theatre:
     """A simulated procedure before its images are made."""
 
     tissue: PosedTissue  # whose `apart` holds the pelvis alone
-    device: Sequence[Solid]  # in CAD space
+    device: Sequence[tuple[str, Volume]]  # materials, with their densities in g/cm³ in CAD space
     poses: Poses  # true
     points: ReferencePoints
     camera: Camera
@@ -101,8 +101,8 @@ def _of_view(theatre: Theatre, view: int) -> Iterator[Drawn]:
         FEMUR: _shadow(theatre.tissue.femur, poses.camera_from(FEMUR)[view], camera, centres[FEMUR], step_mm),
     }
     solids = [
-        (solid.material, _shadow(solid.density, poses.camera_from(DEVICE)[view], camera, centres[DEVICE], step_mm))
-        for solid in theatre.device
+        (material, _shadow(density, poses.camera_from(DEVICE)[view], camera, centres[DEVICE], step_mm))
+        for material, density in theatre.device
     ]
     on_device = together(*({material: shadow[0]} for material, shadow in solids))
     yield _of_image(theatre, view, ANATOMY_IMAGES, tissue, bones, [])

@@ -52,13 +52,12 @@ def simulate_images(
     """
     report("turning the femur")
     tissue = posed_tissue(ct, labels, femur, head_centre, procedure, camera).to(device)
-    metal = metal.to(device)
     del ct, labels
 
     def body(pose: Tensor) -> dict[str, Tensor]:
         return areal_posed_tissue(tissue, pose, camera, settings.step_mm)
 
-    return view_images(body, metal, procedure, camera, settings.step_mm, model, generator, report)
+    return view_images(body, metal, procedure, camera, model, generator, report)
 
 
 def posed_tissue(
@@ -84,7 +83,6 @@ def view_images(
     metal: Metal,
     procedure: Procedure,
     camera: Camera,
-    step_mm: float,
     model: XrayModel,
     generator: torch.Generator,
     report: Callable[[str], None],
@@ -101,11 +99,12 @@ def view_images(
     views = []
     for number, pose in enumerate(poses):
         report(f"imaging view {number + 1} of {len(poses)}")
-        table = areal_solids(metal.table, camera_from_camera1[number], camera, step_mm)
-        device = areal_solids(metal.device, procedure.camera_from_device[number], camera, step_mm)
+        still = body(pose)
+        where = next(iter(still.values())).device
+        table = areal_solids(metal.table, camera_from_camera1[number], camera, where)
+        device = areal_solids(metal.device, procedure.camera_from_device[number], camera, where)
         if on_device is not None:
             device = together(device, on_device(procedure.camera_from_device[number]))
-        still = body(pose)
         later = still if procedure.lps_moved is None else body(pose @ procedure.lps_moved)
         anatomy_image = fluoroscopy(together(still, table), camera, model, generator)
         device_image = fluoroscopy(together(later, table, device), camera, model, generator)

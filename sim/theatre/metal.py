@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 import trimesh
 
 from femoreg_torch.errors import InputError
-from sim.physics.line_integrals import Solid, device_density, solid_of
+from sim.physics.line_integrals import Solid, solid_of
+from sim.physics.materials import metal_density
 from sim.theatre.device import PARTS, make_device_parts
 from sim.theatre.settings import Acquisition
 
@@ -22,10 +22,6 @@ class Metal:
 
     device: list[Solid]  # in CAD space
     table: list[Solid]  # in the frame of camera 1
-
-    def to(self, device: torch.device) -> "Metal":
-        """The same with its densities on a device."""
-        return Metal([solid.to(device) for solid in self.device], [solid.to(device) for solid in self.table])
 
 
 def draw_materials(seed: int) -> dict[str, str]:
@@ -45,14 +41,14 @@ def metal_in_beam(mesh: trimesh.Trimesh, seed: int, settings: Acquisition) -> Me
     Raises `InputError` if the device is to be of several materials, and `mesh` is not that of the seed.
     """
     return Metal(
-        _mixed_device(mesh, seed, settings.step_mm)
+        _mixed_device(mesh, seed)
         if settings.device_materials == "mixed"
-        else [Solid("titanium", device_density(mesh, settings.step_mm, settings.device_hu))],
-        table_solids(seed, settings.step_mm) if settings.table_parts else [],
+        else [Solid("titanium", mesh, metal_density(settings.device_hu))],
+        table_solids(seed) if settings.table_parts else [],
     )
 
 
-def _mixed_device(mesh: trimesh.Trimesh, seed: int, step_mm: float) -> list[Solid]:
+def _mixed_device(mesh: trimesh.Trimesh, seed: int) -> list[Solid]:
     parts = make_device_parts(seed)
     bounds = np.array([part.bounds for part in parts.values()])
     apart = np.abs(np.array([bounds[:, 0].min(0), bounds[:, 1].max(0)]) - mesh.bounds).max()
@@ -63,10 +59,10 @@ def _mixed_device(mesh: trimesh.Trimesh, seed: int, step_mm: float) -> list[Soli
             "the seed that the device was made from, or take `device` out of the patient's case.yaml."
         )
     materials = draw_materials(seed)
-    return [solid_of(part, materials[name], step_mm) for name, part in parts.items()]
+    return [solid_of(part, materials[name]) for name, part in parts.items()]
 
 
-def table_solids(seed: int, step_mm: float) -> list[Solid]:
+def table_solids(seed: int) -> list[Solid]:
     """A steel wire along the table and an aluminium clamp with a steel screw, behind the patient, camera 1 frame, mm.
 
     The wire crosses the whole image of view 1 at one side, the clamp stands into it from the other.
@@ -81,4 +77,4 @@ def table_solids(seed: int, step_mm: float) -> list[Solid]:
     block = trimesh.creation.box((45, 32, 14), transform=trimesh.transformations.translation_matrix(middle))
     screw = trimesh.creation.cylinder(4, segment=middle + np.array([[12 * side, -24, 0], [12 * side, 24, 0]]))
     clamp = trimesh.boolean.difference([block, screw])
-    return [solid_of(wire, "steel", step_mm), solid_of(clamp, "aluminium", step_mm), solid_of(screw, "steel", step_mm)]
+    return [solid_of(wire, "steel"), solid_of(clamp, "aluminium"), solid_of(screw, "steel")]
