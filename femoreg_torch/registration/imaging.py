@@ -66,7 +66,7 @@ def hardened(integrals: Tensor, hardening: float) -> Tensor:
     """
     if not hardening:
         return integrals
-    return torch.log1p(hardening * integrals.clamp_min(0)) / hardening + integrals.clamp_max(0)
+    return torch.where(integrals > 0, torch.log1p(hardening * integrals.clamp_min(0)) / hardening, integrals)
 
 
 def hardened_slope(image: Tensor, hardening: float) -> Tensor:

@@ -5,15 +5,19 @@ from dataclasses import replace
 import pytest
 import torch
 from registration_scenes import CARM, REFERENCE_POINTS, float64, make_scene, off, true_poses
+from scipy.spatial.transform import Rotation
 
+from femoreg_torch.drr import project
 from femoreg_torch.fluoro import binned
-from femoreg_torch.geometry import centred_camera
+from femoreg_torch.geometry import centred_camera, rigid
 from femoreg_torch.registration import Level
 from femoreg_torch.registration.level import binning
 from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.scene import Body
 from femoreg_torch.similarity import GradNcc
-from femoreg_torch.volume import Volume, axis_aligned
+from femoreg_torch.volume import Volume, axis_aligned, voxelise_mesh
+from sim.physics.mesh_paths import mesh_paths
+from sim.theatre.device import make_device
 
 
 @pytest.mark.parametrize(
@@ -70,3 +74,28 @@ def test_an_image_that_changes_in_place_is_averaged_anew() -> None:
     assert level.image(image, camera) is before
     image += 1
     torch.testing.assert_close(level.image(image, camera), before + 1)
+
+
+def test_solids_are_drawn_as_sharp_as_their_surfaces() -> None:
+    """A blurred edge of thick metal takes more light than the metal does; beside exact paths through a device."""
+    mesh, _ = make_device(2)
+    solid = voxelise_mesh(mesh, 0.5, 1000.0)
+    device = solid.with_data(solid.data / solid.data.max())
+    camera = centred_camera(1000.0, (0.5, 0.5), (200, 200))
+    turn = torch.from_numpy(Rotation.from_euler("xyz", (70, 40, 30), degrees=True).as_matrix())
+    pose = rigid(turn, float64(0, 20, 590))
+    exact = mesh_paths(mesh, pose, camera)
+    steel = 0.5  # 1/mm
+
+    def too_much(level: Level, sharp: bool) -> float:
+        drawn = project([level.volume(device, sharp=sharp)], pose[None, None], camera, 0.5)[0]
+        taken, truly = (1 - (-steel * paths).exp() for paths in (drawn, exact))
+        return float(taken.sum() / truly.sum()) - 1
+
+    fine, coarse = Level(0.5, 0.5), Level(0.5, 1.0)
+    assert too_much(fine, sharp=False) > 0.01
+    assert abs(too_much(fine, sharp=True)) < 0.2 * too_much(fine, sharp=False)
+    assert abs(too_much(coarse, sharp=True)) < 0.3 * too_much(coarse, sharp=False)
+    assert fine.volume(device) is device
+    assert fine.volume(device, sharp=True) is Level(2.0, 0.9).volume(device, sharp=True)  # made once
+    assert max(coarse.volume(device, sharp=True).spacing_mm) == 1.0

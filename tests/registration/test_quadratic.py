@@ -109,6 +109,18 @@ def test_metal_hardens_the_beam_as_a_spectrum_of_attenuations_does(hardening: fl
     assert hardened(integrals, 0) is integrals
 
 
+def test_less_than_nothing_does_not_harden() -> None:
+    """Beside the edges of sharpened volumes; there 1 + h L might not even be positive."""
+    integrals = torch.tensor([-20.0, -0.1, 0.0, 1e-4], dtype=torch.float64, requires_grad=True)
+    seen = hardened(integrals, 0.2)
+    assert seen.tolist() == pytest.approx([-20.0, -0.1, 0.0, 1e-4], abs=1e-8)
+    slope = torch.autograd.grad(seen.sum(), integrals)[0]
+    expected = hardened_slope(seen.detach(), 0.2)
+    assert expected.tolist() == pytest.approx([1, 1, 1, 1], abs=1e-4)
+    away_from_the_bend = [0, 1, 3]
+    assert torch.allclose(slope[away_from_the_bend], expected[away_from_the_bend])
+
+
 def test_scatter_that_the_images_tell_stands_in_for_a_guess_that_is_far_off() -> None:
     poses = true_poses()
     nothing = torch.zeros(1, 0, dtype=torch.float64)

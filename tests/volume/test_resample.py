@@ -1,12 +1,13 @@
 """Crops and resampled volumes against a field that is known everywhere in space."""
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.volume import Volume, axis_aligned, crop, halved, resample_isotropic
+from femoreg_torch.volume import Volume, axis_aligned, crop, halved, resample_isotropic, sharpened
 
 GRADIENT = torch.tensor([1.5, -0.7, 0.4], dtype=torch.float64)  # HU per mm of L, P, S
 
@@ -87,3 +88,43 @@ def test_halved_volumes_keep_sums_and_places() -> None:
 def test_voxels_larger_than_the_volume_are_refused() -> None:
     with pytest.raises(InputError, match="larger than the whole volume"):
         resample_isotropic(ramp(), 40.0)
+
+
+def test_what_is_sharpened_is_no_wider_than_what_its_voxels_are_means_of() -> None:
+    """Second moments of slabs at all places of a grid, and of what interpolation makes of their means over voxels."""
+    places = np.arange(-10, 10.0001, 0.01)
+    edges = np.arange(-8, 9) - 0.5  # of voxels
+
+    def spread(values: np.ndarray) -> float:
+        middle = np.average(places, weights=values)
+        return float(np.average((places - middle) ** 2, weights=values))
+
+    for axis in range(3):
+        wider, blurred = [], []
+        for low in np.linspace(-3.2, -2.2, 20, endpoint=False):
+            high = low + 5.7
+            means = np.clip(edges[1:], low, high) - np.clip(edges[:-1], low, high)
+            row = torch.zeros(16, 5, 5)
+            row[:, 2, 2] = torch.from_numpy(means)
+            volume = Volume(row.movedim(0, axis).contiguous(), axis_aligned((1, 1, 1), (0, 0, 0)))
+            sharp = sharpened(volume).data.movedim(axis, 0).sum((1, 2)).double().numpy()
+            assert sharp.sum() == pytest.approx(5.7)
+            wider.append(spread(np.interp(places, np.arange(-8, 8), sharp)) - 5.7**2 / 12)
+            blurred.append(spread(np.interp(places, np.arange(-8, 8), means)) - 5.7**2 / 12)
+        assert np.mean(wider) == pytest.approx(0, abs=0.003)
+        assert np.mean(blurred) == pytest.approx(0.25, abs=0.003)
+
+
+def test_sharpened_solids_stay_flat_inside_and_empty_far_away() -> None:
+    data = torch.zeros(12, 14, 10)
+    data[3:9, 3:11, 3:7] = 0.3
+    volume = Volume(data, axis_aligned((0.5, 0.5, 0.5), (0, 0, 0)))
+    sharp = sharpened(volume)
+    assert torch.equal(sharp.lps_from_index, volume.lps_from_index)
+    torch.testing.assert_close(sharp.data[4:8, 4:10, 4:6], data[4:8, 4:10, 4:6])
+    far = torch.ones_like(data, dtype=torch.bool)
+    far[2:10, 2:12, 2:8] = False
+    assert (sharp.data[far] == 0).all()
+    assert sharp.data.sum() == pytest.approx(float(data.sum()), rel=1e-5)
+    assert sharp.data[2, 5, 5] == pytest.approx(-0.3 / 8)
+    assert torch.equal(volume.data, data)  # it is not changed in place
