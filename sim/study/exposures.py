@@ -24,10 +24,10 @@ from femoreg_torch.geometry import Camera, Poses
 from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.registration.imaging import Imaging, tissue_integrals
 from femoreg_torch.registration.scene import Scene
-from femoreg_torch.volume import Volume
+from femoreg_torch.volume import Volume, sharpened
 from sim.physics.beam import open_beam, shutter
 from sim.physics.fluoroscopy import XrayModel, photons_per_pixel, scattered, transmission
-from sim.physics.line_integrals import together
+from sim.physics.line_integrals import Solid, together
 from sim.physics.materials import WATER_PER_BONE
 from sim.study.information import Information, image_information
 from sim.study.responses import centres_in, view_block
@@ -35,6 +35,7 @@ from sim.theatre.posed_tissue import PosedTissue, areal_posed_tissue
 
 DISTANCE = "source distance"
 _WAVES = 6  # half waves across the detector, along rows and columns, of soft tissue whose shape is unknown
+_DEVICE_MM = 0.5  # voxels that the device is drawn on: photons have to change smoothly as it moves
 
 
 def image_name(kind: str, view: int) -> str:
@@ -69,7 +70,7 @@ class Theatre:
     """A simulated procedure before its images are made."""
 
     tissue: PosedTissue  # whose `apart` holds the pelvis alone
-    device: Sequence[tuple[str, Volume]]  # materials, with their densities in g/cm³ in CAD space
+    device: Sequence[Solid]  # in CAD space
     poses: Poses  # true
     points: ReferencePoints
     camera: Camera
@@ -87,11 +88,12 @@ def simulated_images(theatre: Theatre) -> Iterator[Drawn]:
     for key in ("motion_mm", "glare", "vignetting", "collimator_mm"):
         if getattr(model, key):
             raise InputError(f"bound: what `{key}: {getattr(model, key):g}` of the X-rays costs is not known here.")
+    densities = [(solid.material, sharpened(solid.voxels(_DEVICE_MM))) for solid in theatre.device]
     for view in range(len(theatre.poses.camera_from_camera1)):
-        yield from _of_view(theatre, view)
+        yield from _of_view(theatre, view, densities)
 
 
-def _of_view(theatre: Theatre, view: int) -> Iterator[Drawn]:
+def _of_view(theatre: Theatre, view: int, densities: Sequence[tuple[str, Volume]]) -> Iterator[Drawn]:
     camera, poses, step_mm = theatre.camera, theatre.poses, theatre.step_mm
     tissue = areal_posed_tissue(theatre.tissue, poses.camera_from(PELVIS)[view], camera, step_mm)
     centres = centres_in(poses, theatre.points, view)
@@ -102,7 +104,7 @@ def _of_view(theatre: Theatre, view: int) -> Iterator[Drawn]:
     }
     solids = [
         (material, _shadow(density, poses.camera_from(DEVICE)[view], camera, centres[DEVICE], step_mm))
-        for material, density in theatre.device
+        for material, density in densities
     ]
     on_device = together(*({material: shadow[0]} for material, shadow in solids))
     yield _of_image(theatre, view, ANATOMY_IMAGES, tissue, bones, [])

@@ -179,10 +179,7 @@ def imagine(setting: Setting, procedure: Procedure, body: Body, scratch: Path, p
     binned = max(1, round(pixel_mm / carm.camera.mean_pixel_mm))
     theatre = Theatre(
         tissue,
-        [
-            (solid.material, solid.voxels(acquisition.step_mm))
-            for solid in metal_in_beam(mesh, body.device_seed, acquisition).device
-        ],
+        metal_in_beam(mesh, body.device_seed, acquisition).device,
         drawn.truth,
         reference_points(case),
         carm.camera.downsampled(binned),

@@ -90,7 +90,7 @@ def test_changes_by_the_device_are_those_of_photons_expected_anew(
         there = replace(theatre, poses=poses, model=replace(theatre.model, scatter=0))
         return next(i.expected for i in simulated_images(there) if (i.kind, i.view) == ("device", 0))
 
-    for place, size in ((1, 0.002), (3, 0.05), (5, 0.2)):
+    for place, size in ((1, 0.0005), (3, 0.02), (5, 0.1)):
         step = torch.zeros(6, dtype=torch.float64)
         step[place] = size
         expected = (photons(step) - photons(-step)) / (2 * size)
