@@ -43,9 +43,20 @@ def metal_in_beam(mesh: trimesh.Trimesh, seed: int, settings: Acquisition) -> Me
     return Metal(
         _mixed_device(mesh, seed)
         if settings.device_materials == "mixed"
-        else [Solid("titanium", mesh, metal_density(settings.device_hu))],
+        else [Solid("titanium", united(mesh), metal_density(settings.device_hu))],
         table_solids(seed) if settings.table_parts else [],
     )
+
+
+def united(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A closed mesh whose bodies, where they overlap, are one: what lies in two of them is not twice as dense.
+
+    A mesh with closed hollows is left as it is.
+    """
+    bodies = mesh.split(only_watertight=False)
+    if len(bodies) < 2 or any(body.volume < 0 for body in bodies):
+        return mesh
+    return trimesh.boolean.union(list(bodies))
 
 
 def _mixed_device(mesh: trimesh.Trimesh, seed: int) -> list[Solid]:

@@ -13,7 +13,7 @@ from femoreg_torch.volume.materials import DENSITIES
 from sim.physics.line_integrals import areal_solids, device_density, solid_of, together
 from sim.physics.materials import metal_density
 from sim.theatre.device import PARTS, make_device, make_device_parts
-from sim.theatre.metal import draw_materials, metal_in_beam, table_solids
+from sim.theatre.metal import draw_materials, metal_in_beam, table_solids, united
 from sim.theatre.settings import load_simulation
 
 CAMERA = centred_camera(1000.0, (3.0, 3.0), (96, 96))
@@ -77,9 +77,21 @@ def test_as_the_presets_say_the_device_is_titanium_alone(acquisition) -> None:
     assert metal.table == []
     (solid,) = metal.device
     assert solid.material == "titanium"
-    assert solid.mesh is mesh
+    assert solid.mesh.volume == pytest.approx(mesh.volume)
     assert solid.density == metal_density(5000)
     torch.testing.assert_close(solid.voxels(2.0).data, device_density(mesh, 2.0, 5000).data)
+
+
+def test_bodies_that_overlap_are_one_and_hollows_stay() -> None:
+    pin, block = trimesh.creation.cylinder(3, 40), trimesh.creation.box((20, 20, 20))
+    both = united(trimesh.util.concatenate([pin, block]))
+    areal = areal_solids([solid_of(both, "steel")], POSE, CAMERA)["steel"]
+    assert areal[47:49, 47:49].mean().item() == pytest.approx(4.0 * DENSITIES["steel"], rel=1e-4)
+    hollow = trimesh.creation.box((10, 10, 10))
+    hollow.invert()
+    shell = trimesh.util.concatenate([block, hollow])
+    areal = areal_solids([solid_of(united(shell), "steel")], POSE, CAMERA)["steel"]
+    assert areal[47:49, 47:49].mean().item() == pytest.approx(1.0 * DENSITIES["steel"], rel=1e-4)
 
 
 def test_a_mixed_device_is_that_of_its_seed(acquisition) -> None:
