@@ -14,6 +14,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, project_points, transform_points
 
 
@@ -26,11 +27,13 @@ def mesh_paths(mesh: trimesh.Trimesh, camera_from_mesh: Tensor, camera: Camera) 
         camera: with the source at its origin. All of the mesh lies in front of it.
 
     Raises:
-        ValueError: for a mesh that reaches behind the source.
+        InputError: for a mesh that reaches behind the source.
     """
     vertices = transform_points(camera_from_mesh, torch.from_numpy(np.array(mesh.vertices, np.float64)))
     if float(vertices[:, 2].min()) <= 0:
-        raise ValueError("mesh_paths: the mesh reaches behind the X-ray source.")
+        raise InputError(
+            "X-rays: the device or the table reaches behind the X-ray source. Check its size and its pose."
+        )
     pixels = project_points(camera, vertices).numpy()  # (V, 2) column, row
     detector = np.array([camera.sdd_mm, *camera.pixel_mm, *camera.principal_point_px])
     paths = np.zeros(camera.shape)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from femoreg_torch.drr import project
+from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, centred_camera, rigid
 from femoreg_torch.volume import voxelise_mesh
 from sim.physics.mesh_paths import mesh_paths
@@ -103,5 +104,5 @@ def test_the_projector_sees_the_same_mass_less_sharply() -> None:
 
 
 def test_nothing_lies_behind_the_source() -> None:
-    with pytest.raises(ValueError, match="behind the X-ray source"):
+    with pytest.raises(InputError, match="behind the X-ray source"):
         mesh_paths(trimesh.creation.box((10, 10, 10)), at(0, 0, 4), CAMERA)
