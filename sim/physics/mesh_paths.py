@@ -31,9 +31,7 @@ def mesh_paths(mesh: trimesh.Trimesh, camera_from_mesh: Tensor, camera: Camera) 
     """
     vertices = transform_points(camera_from_mesh, torch.from_numpy(np.array(mesh.vertices, np.float64)))
     if float(vertices[:, 2].min()) <= 0:
-        raise InputError(
-            "X-rays: the device or the table reaches behind the X-ray source. Check its size and its pose."
-        )
+        raise InputError("X-rays: the device or the table reaches behind the source. Check its size and its pose.")
     pixels = project_points(camera, vertices).numpy()  # (V, 2) column, row
     detector = np.array([camera.sdd_mm, *camera.pixel_mm, *camera.principal_point_px])
     paths = np.zeros(camera.shape)

@@ -104,5 +104,5 @@ def test_the_projector_sees_the_same_mass_less_sharply() -> None:
 
 
 def test_nothing_lies_behind_the_source() -> None:
-    with pytest.raises(InputError, match="behind the X-ray source"):
+    with pytest.raises(InputError, match="behind the source"):
         mesh_paths(trimesh.creation.box((10, 10, 10)), at(0, 0, 4), CAMERA)
