@@ -106,8 +106,11 @@ def areal_solids(
 
     From the surfaces themselves, not from voxels as registration draws them: a device is imaged as sharply as it is.
     """
-    paths = (mesh_paths(solid.mesh, camera_from_solids, camera) for solid in solids)  # mm · g/cm³ to g/cm²
-    areal = ({solid.material: path * (solid.density / 10)} for solid, path in zip(solids, paths, strict=True))
+    paths = (mesh_paths(solid.mesh, camera_from_solids, camera) for solid in solids)
+    # A body that is inside out beside others has no shadow, nor has it any voxels. mm · g/cm³ to g/cm².
+    areal = (
+        {solid.material: path.clamp_min(0) * (solid.density / 10)} for solid, path in zip(solids, paths, strict=True)
+    )
     return {material: mass.to(device) for material, mass in together(*areal).items()}
 
 

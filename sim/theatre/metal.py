@@ -51,10 +51,11 @@ def metal_in_beam(mesh: trimesh.Trimesh, seed: int, settings: Acquisition) -> Me
 def united(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """A closed mesh whose bodies, where they overlap, are one: what lies in two of them is not twice as dense.
 
-    A mesh with closed hollows is left as it is.
+    A mesh with closed hollows is left as it is, and so is one of bodies that share edges: paths through bodies that
+    only touch add up rightly.
     """
     bodies = mesh.split(only_watertight=False)
-    if len(bodies) < 2 or any(body.volume < 0 for body in bodies):
+    if len(bodies) < 2 or not all(body.is_volume and body.volume > 0 for body in bodies):
         return mesh
     return trimesh.boolean.union(list(bodies))
 

@@ -10,6 +10,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import load_carm
 from femoreg_torch.optimize import Bobyqa, CmaEs, LevenbergMarquardt
 from femoreg_torch.registration import BodyPlan, OrbitSearch, Stage, load_plan, plan_from
+from femoreg_torch.registration.calibration import Calibration
 from femoreg_torch.registration.level import Level, binning
 from femoreg_torch.similarity import GradNcc, Ncc
 
@@ -76,6 +77,8 @@ def test_the_paper_preset_is_the_papers() -> None:
     for step in (*plan.stages, orbit):
         assert step.level.pixel_mm == 0.78
         assert step.similarity == GradNcc(patch_radius=10)
+    (materials,) = (step for step in plan.steps if isinstance(step, Calibration))  # the one that is not
+    assert plan.steps.index(materials) == len(plan.steps) - 2
     assert all(isinstance(stage.optimiser, Bobyqa) for stage in plan.stages if len(stage.bodies) > 1)
     assert all(isinstance(stage.optimiser, CmaEs) for stage in plan.stages if len(stage.bodies) == 1)
 

@@ -87,6 +87,11 @@ def test_bodies_that_overlap_are_one_and_hollows_stay() -> None:
     both = united(trimesh.util.concatenate([pin, block]))
     areal = areal_solids([solid_of(both, "steel")], POSE, CAMERA)["steel"]
     assert areal[47:49, 47:49].mean().item() == pytest.approx(4.0 * DENSITIES["steel"], rel=1e-4)
+    beside = trimesh.creation.box((20, 20, 20), transform=trimesh.transformations.translation_matrix((0, 0, 20)))
+    touching = trimesh.util.concatenate([block, beside])
+    touching.merge_vertices()
+    areal = areal_solids([solid_of(united(touching), "steel")], POSE, CAMERA)["steel"]
+    assert areal[47:49, 47:49].mean().item() == pytest.approx(4.0 * DENSITIES["steel"], rel=1e-4)
     hollow = trimesh.creation.box((10, 10, 10))
     hollow.invert()
     shell = trimesh.util.concatenate([block, hollow])
