@@ -99,6 +99,15 @@ def test_bodies_that_overlap_are_one_and_hollows_stay() -> None:
     assert areal[47:49, 47:49].mean().item() == pytest.approx(1.0 * DENSITIES["steel"], rel=1e-4)
 
 
+def test_a_body_inside_out_beside_others_has_no_shadow() -> None:
+    block, other = trimesh.creation.box((20, 20, 20)), trimesh.creation.box((5, 5, 5))
+    other.invert()
+    other.apply_translation((40, 0, 0))
+    areal = areal_solids([solid_of(united(trimesh.util.concatenate([block, other])), "steel")], POSE, CAMERA)["steel"]
+    alone = areal_solids([solid_of(block, "steel")], POSE, CAMERA)["steel"]
+    assert torch.equal(areal, alone)
+
+
 def test_a_mixed_device_is_that_of_its_seed(acquisition) -> None:
     mesh, _ = make_device(2)
     mixed = replace(acquisition, device_materials="mixed")
