@@ -27,7 +27,8 @@ def check_closed(mesh: "trimesh.Trimesh", where: str) -> "trimesh.Trimesh":
     """`mesh` itself, with outward normals, if it is closed. Raises `InputError` that names `where` if it is not.
 
     Bodies may touch or overlap, as those of an assembly in one file do: every edge is to be run through as often one
-    way as the other. What lies in two bodies lies inside, once.
+    way as the other. What lies in two bodies lies inside, once. A body that stands twice in the mesh is left once.
+    A body that is inside out is turned, unless it lies in another one, in which it is a hollow.
     """
     if len(mesh.faces) == 0:
         raise InputError(f"{where}: the mesh holds no triangle.")
@@ -51,7 +52,64 @@ def check_closed(mesh: "trimesh.Trimesh", where: str) -> "trimesh.Trimesh":
     if volume < 0:
         mesh = mesh.copy()
         mesh.invert()
-    return mesh
+    return _bodies_turned(_each_body_once(mesh))
+
+
+def _each_body_once(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
+    """The closed mesh without faces that stand in it twice alike, if it is still closed, or itself."""
+    lowest_first = np.take_along_axis(mesh.faces, (mesh.faces.argmin(1)[:, None] + np.arange(3)) % 3, 1)
+    first = np.unique(lowest_first, axis=0, return_index=True)[1]
+    if len(first) == len(mesh.faces):
+        return mesh
+    once = mesh.copy()
+    once.update_faces(np.sort(first))
+    # a wall that two nested bodies share is needed by both
+    ways = np.where(once.edges[:, 0] < once.edges[:, 1], 1, -1)
+    return mesh if np.bincount(once.edges_unique_inverse, ways).any() else once
+
+
+def _bodies_turned(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
+    """The closed mesh with its bodies that are inside out turned, unless they are hollows of others, or itself.
+
+    Bodies that share edges are not told apart, and left as they are.
+    """
+    import trimesh
+
+    if not mesh.is_watertight:  # by trimesh, for whom an edge joins two faces
+        return mesh
+    bodies = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(len(mesh.faces)))
+    if len(bodies) == 1:
+        return mesh
+    corners = mesh.triangles
+    middle = mesh.bounds.mean(0)
+    volumes = np.einsum("fi,fi->f", corners[:, 0] - middle, np.cross(corners[:, 1] - middle, corners[:, 2] - middle))
+    turned = [body for body in bodies if volumes[body].sum() < 0 and _stands_out(body, corners)]
+    if not turned:
+        return mesh
+    faces = np.array(mesh.faces)
+    whole = np.concatenate(turned)
+    faces[whole] = faces[whole, ::-1]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+def _stands_out(body: np.ndarray, triangles: np.ndarray) -> bool:
+    """Whether one of the outermost corners of a body, faces by number, lies in none of the others."""
+    corners = triangles[body].reshape(-1, 3)
+    others = np.delete(triangles, body, axis=0)
+    return any(_windings(others, corners[k]) < 0.5 for k in {*corners.argmin(0), *corners.argmax(0)})
+
+
+def _windings(triangles: np.ndarray, point: np.ndarray) -> float:
+    """How often closed triangles (F, 3, 3) wind around a point: 1 inside a body, 0 outside all.
+
+    Sum of solid angles: Van Oosterom and Strackee, IEEE Trans Biomed Eng 30 (1983), equation 8.
+    """
+    a, b, c = np.moveaxis(triangles - point, 1, 0)
+    p, q, r = (np.linalg.norm(edge, axis=1) for edge in (a, b, c))
+    above = np.einsum("fi,fi->f", a, np.cross(b, c))
+    dot = np.einsum("kfi,kfi->kf", np.stack([a, b, c]), np.stack([b, c, a]))
+    below = p * q * r + dot[0] * r + dot[1] * p + dot[2] * q
+    return float(np.arctan2(above, below).sum() / (2 * np.pi))
 
 
 @numba.njit(cache=True, nogil=True)

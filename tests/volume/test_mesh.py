@@ -81,6 +81,45 @@ def test_bodies_of_an_assembly_may_touch_in_a_face_or_an_edge(tmp_path: Path) ->
     assert (volume.data / MU).max() == pytest.approx(1)
 
 
+def _block(size: float, at: tuple[float, float, float], *, inside_out: bool = False) -> trimesh.Trimesh:
+    block = trimesh.creation.box((size, size, size)).apply_translation(at)
+    if inside_out:
+        block.invert()
+    return block
+
+
+@pytest.mark.parametrize("place", [(30, 0, 0), (5, 5, 10), (0, 0, 200)])  # apart, or with a corner in it, or far away
+def test_a_body_that_is_inside_out_beside_others_is_turned(tmp_path: Path, place: tuple[float, float, float]) -> None:
+    bodies = [_block(20, (0, 0, 0)), _block(9, place, inside_out=True), _block(3, (-40, 0, 0))]
+    trimesh.util.concatenate(bodies).export(tmp_path / "device.stl")
+    mesh = read_mesh(tmp_path / "device.stl")
+    bodies[1].invert()
+    rightly = trimesh.util.concatenate(bodies)
+    assert mesh.volume == pytest.approx(rightly.volume)
+    assert torch.equal(voxelise_mesh(mesh, 0.5, 5000).data, voxelise_mesh(rightly, 0.5, 5000).data)
+
+
+def test_a_hollow_stays_one_and_what_floats_in_it_is_solid(tmp_path: Path) -> None:
+    bodies = [_block(20, (0, 0, 0)), _block(10, (1, 1, 1), inside_out=True), _block(4, (1, 1, 1))]
+    trimesh.util.concatenate(bodies).export(tmp_path / "device.stl")
+    assert read_mesh(tmp_path / "device.stl").volume == pytest.approx(8000 - 1000 + 64)
+
+
+def test_a_body_that_stands_twice_in_a_file_is_left_once(tmp_path: Path) -> None:
+    bodies = [_block(20, (0, 0, 0)), _block(9, (30, 0, 0)), _block(9, (30, 0, 0))]
+    trimesh.util.concatenate(bodies).export(tmp_path / "device.stl")
+    assert read_mesh(tmp_path / "device.stl").volume == pytest.approx(8000 + 729)
+
+
+def test_a_wall_that_two_nested_bodies_share_is_kept() -> None:
+    outer, inner = _block(20, (0, 0, 0)), _block(20, (0, 0, 0))
+    inner.vertices[inner.vertices[:, 0] > 0, 0] = 4.0  # five of its walls lie in the other's, one of them alike
+    both = trimesh.util.concatenate([outer, inner])
+    both.merge_vertices()
+    volume = voxelise_mesh(check_closed(both, "model"), 0.5, 5000)
+    assert (volume.data / MU).sum() * 0.125 == pytest.approx(8000, rel=1e-5)
+
+
 def test_triangles_without_an_area_are_left_out(tmp_path: Path) -> None:
     box = trimesh.creation.box((10, 6, 4))
     corner, other = box.vertices[box.faces[0, :2]]
