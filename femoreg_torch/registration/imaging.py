@@ -44,16 +44,18 @@ class Imaging:
             return self
         return replace(self, scatter=scatter)
 
-    def image(self, integrals: Tensor) -> Tensor:
-        """What is seen of line integrals."""
-        return -((-integrals).exp() + self.scatter).log() if self.scatter else integrals
-
-    def slope(self, integrals: Tensor) -> Tensor:
-        """Its derivative by them."""
-        return 1 / (1 + self.scatter * integrals.exp())
-
 
 PLAIN = Imaging()
+
+
+def filled(integrals: Tensor, scatter: Tensor | None) -> Tensor:
+    """What is seen of line integrals (..., H, W) where light per primary light, () or (H, W), fills their shadows."""
+    return integrals if scatter is None else -((-integrals).exp() + scatter).log()
+
+
+def filled_slope(integrals: Tensor, scatter: Tensor | None) -> Tensor:
+    """The derivative of `filled` by the integrals."""
+    return torch.ones_like(integrals) if scatter is None else 1 / (1 + scatter * integrals.exp())
 
 
 def hardened(integrals: Tensor, hardening: float) -> Tensor:

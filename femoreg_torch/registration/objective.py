@@ -11,18 +11,21 @@ from femoreg_torch.cores import on_all_cores, shares
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, Poses, transform_points, twist_rates
 from femoreg_torch.optimize import Quadratic, SmoothObjective
+from femoreg_torch.registration.compared import prepared, veil_over
 from femoreg_torch.registration.imaging import (
     PLAIN,
     Imaging,
     draw,
     draw_with_jacobian,
+    filled,
+    filled_slope,
     hardened_slope,
     tissue_integrals,
 )
 from femoreg_torch.registration.intrinsics import PRIOR_WEIGHT, Intrinsics
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.scene import Body, Kind, Moving, RigidObject, Scene, split
-from femoreg_torch.registration.weights import Weighting, believed, pixel_weights, prepared
+from femoreg_torch.registration.weights import Weighting, believed, pixel_weights
 from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import FixedSimilarity, Similarity, similarity_quadratics
 from femoreg_torch.volume import Volume
@@ -52,7 +55,7 @@ class _Target:
     background: Tensor  # (H, W), line integrals of all that stands still
     moving: tuple[str, ...]
     tissue: Tensor | None  # (H, W): seen besides, or nothing
-    imaging: Imaging
+    scatter: Tensor | None  # per primary light, () or (H, W): fills shadows, or nothing
 
     def cost(self, drawn: Tensor) -> Tensor:
         """Costs (P,) of line integrals (P, H, W)."""
@@ -60,7 +63,7 @@ class _Target:
 
     def seen(self, drawn: Tensor) -> Tensor:
         """Images (..., H, W) of line integrals."""
-        image = self.imaging.image(drawn)
+        image = filled(drawn, self.scatter)
         return image if self.tissue is None else image + self.tissue
 
 
@@ -89,15 +92,19 @@ def _target(
         background = draw([scene.objects[name] for name in still], where, camera, level.step_mm)[0]
     placing = [name for body in rigid for name in body.objects]
     looked_at = pixel_weights(scene, poses, render, placing, image, camera, level.step_mm, weights)
-    imaging = imaging.as_seen(scene.scatter)
-    sure = believed(scene, poses, render, image, camera, level.step_mm, imaging)
+    seen = imaging.as_seen(scene.scatter)
+    veil = veil_over(scene, poses, render, image, camera, level, imaging.scatter - seen.scatter, seen.scatter)
+    scatter = torch.tensor(seen.scatter, device=scene.device) if seen.scatter else None
+    if veil is not None:
+        scatter = seen.scatter + veil.light
+    sure = believed(scene, poses, render, image, camera, level.step_mm, scatter)
     if sure is not None:
         looked_at = sure if looked_at is None else looked_at * sure
-    fixed = prepared(scene, image, level, similarity, looked_at)
+    fixed = prepared(scene, image, level, similarity, looked_at, veil)
     tissue = None
     if imaging.tissue and scene.tissue is not None:
         tissue = imaging.tissue * tissue_integrals(scene.tissue, poses.camera_from(scene.anchor)[view], camera)
-    return _Target(view, camera, fixed, background, tuple(n for n in drawn if n in moves), tissue, imaging)
+    return _Target(view, camera, fixed, background, tuple(n for n in drawn if n in moves), tissue, scatter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +303,9 @@ class ImageCosts:
                 place = poses[target.moving.index(name)][None, None]
                 change = project([difference], place, camera, self.step_mm)
                 jacobians.append(change * hardened_slope(seen[target.view, name][0], self.objects[name].hardening))
-        changes = torch.cat(jacobians) * target.imaging.slope(drawn)
+        changes = torch.cat(jacobians)
+        if target.scatter is not None:
+            changes *= filled_slope(drawn, target.scatter)
         return target.similarity, target.seen(drawn), changes.movedim(0, -1)
 
 

@@ -12,6 +12,7 @@ from femoreg_torch.cores import on_all_cores
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, orbit_angles, transform_points
+from femoreg_torch.registration.compared import exposed_field, prepared
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.scene import Kind, Scene
 from femoreg_torch.registration.step import (
@@ -23,7 +24,6 @@ from femoreg_torch.registration.step import (
     lacking,
     one_after_another,
 )
-from femoreg_torch.registration.weights import exposed_field, prepared
 from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import Similarity, shift_correlation
 

@@ -12,10 +12,9 @@ from torch.nn import functional as F
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, Poses, project_points
-from femoreg_torch.registration.imaging import Imaging, draw, hardened_slope
-from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.imaging import draw, filled, filled_slope, hardened_slope
 from femoreg_torch.registration.scene import Kind, Scene, Segmentation
-from femoreg_torch.similarity import FixedSimilarity, Similarity, against_field, derivative_taps, image_gradients
+from femoreg_torch.similarity import derivative_taps, image_gradients
 
 # bones: the objects that the stage draws, where the network sees them. What the network does not know (an instrument)
 # counts where it is drawn at its present pose.
@@ -76,9 +75,11 @@ def believed(
     image: tuple[Kind, int],
     camera: Camera,
     step_mm: float,
-    imaging: Imaging,
+    scatter: Tensor | None,
 ) -> Tensor | None:
     """Weights (H, W), 0 to 1, of an image (kind, view): lower where what is drawn may be wrong; None where all is sure.
+
+    Light per primary light, `scatter`, fills the shadows, see `imaging.filled`.
 
     Where the materials of an object were estimated, a block at the border of two may be drawn as the wrong one. That
     draws edges which the image does not have, and a strong one outweighs the faint true ones of its patch. With g² the
@@ -93,13 +94,13 @@ def believed(
     where = {name: poses.camera_from(name)[view][None, None] for name in names}
     alone = {name: draw([scene.objects[name]], pose, camera, step_mm)[0] for name, pose in where.items()}
     drawn = torch.stack(list(alone.values())).sum(0)
-    slope = imaging.slope(drawn)
+    slope = filled_slope(drawn, scatter)
     mistakes = torch.zeros_like(drawn)
     for name in unsure:
         seen = slope * hardened_slope(alone[name], scene.objects[name].hardening)
         for difference in scene.objects[name].unsure:
             mistakes += _edges(seen * project([difference], where[name], camera, step_mm)[0])
-    edges, mistakes = (_over_patches(of) for of in (_edges(imaging.image(drawn)), mistakes))
+    edges, mistakes = (_over_patches(of) for of in (_edges(filled(drawn, scatter)), mistakes))
     return (edges + _FLAT) / (edges + _MISTAKES * mistakes + _FLAT)
 
 
@@ -111,27 +112,6 @@ def _edges(image: Tensor) -> Tensor:
 def _over_patches(image: Tensor) -> Tensor:
     """The mean (H, W) around each pixel of an image (H, W)."""
     return F.avg_pool2d(image[None], 2 * _PATCH_RADIUS + 1, 1, _PATCH_RADIUS)[0]
-
-
-def prepared(
-    scene: Scene, image: tuple[Kind, int], level: Level, similarity: Similarity, weights: Tensor | None = None
-) -> FixedSimilarity:
-    """A similarity against an image (kind, view) at a level, by what is exposed; `weights` (H, W) are of its pixels.
-
-    Raises `InputError` where nothing is left to compare.
-    """
-    kind, view = image
-    fixed = level.image(scene.image(kind, view), scene.carm.camera)
-    try:
-        return against_field(similarity, fixed, weights, exposed_field(scene, image, level))
-    except InputError as error:
-        raise InputError(f"view {view + 1}, {kind} image: {error}") from error
-
-
-def exposed_field(scene: Scene, image: tuple[Kind, int], level: Level) -> Tensor | None:
-    """The pixels (H, W), bool, of a level that the shutters of an image (kind, view) leave whole; None without any."""
-    exposed = scene.field(*image)
-    return None if exposed is None else level.field(exposed, scene.carm.camera)
 
 
 def _bones(scene: Scene, poses: Poses, names: Sequence[str], view: int, camera: Camera, step_mm: float) -> Tensor:

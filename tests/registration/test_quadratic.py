@@ -10,7 +10,7 @@ import torch
 from registration_scenes import REFERENCE_POINTS, VOLUMES, float64, make_scene, off, segmentations, true_poses
 
 from femoreg_torch.registration import imaging as drawing
-from femoreg_torch.registration.imaging import PLAIN, Imaging, hardened, hardened_slope
+from femoreg_torch.registration.imaging import PLAIN, Imaging, filled, filled_slope, hardened, hardened_slope
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import Prior, image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, reference_point_in_view
@@ -88,12 +88,14 @@ def test_at_the_solution_the_curvature_is_that_of_the_values() -> None:
 def test_scatter_fills_dark_shadows() -> None:
     """I = exp(−L) + s, seen as −log I: thin parts hardly change, and thick metal cannot be darker than the scatter."""
     integrals = torch.tensor([0.0, 1.0, 30.0], dtype=torch.float64, requires_grad=True)
-    seen = Imaging(scatter=0.25).image(integrals)
+    light = torch.tensor(0.25, dtype=torch.float64)
+    seen = filled(integrals, light)
     expected = [-math.log(1.25), -math.log(math.exp(-1) + 0.25), -math.log(0.25)]
     assert seen.tolist() == pytest.approx(expected)
-    assert torch.equal(PLAIN.image(integrals), integrals)
+    assert filled(integrals, None) is integrals
     slope = torch.autograd.grad(seen.sum(), integrals)[0]
-    assert torch.allclose(slope, Imaging(scatter=0.25).slope(integrals.detach()))
+    assert torch.allclose(slope, filled_slope(integrals.detach(), light))
+    assert filled_slope(integrals, None).tolist() == [1, 1, 1]
 
 
 @pytest.mark.parametrize("hardening", [0.05, 0.35])

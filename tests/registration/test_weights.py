@@ -12,7 +12,6 @@ from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, pose_difference
 from femoreg_torch.optimize import LevenbergMarquardt
-from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, Scene, Segmentation, moved
@@ -160,10 +159,10 @@ def with_a_mistake(scene: Scene, unsure: bool) -> Scene:
 
 def test_what_may_be_drawn_wrong_counts_less_and_all_else_as_before(scene: Scene) -> None:
     """Little where a false block is drawn, and all where no patch reaches it."""
-    assert believed(scene, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, PLAIN) is None
+    assert believed(scene, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, None) is None
     unsure = with_a_mistake(scene, unsure=True)
-    assert believed(unsure, TRUTH, ALL, ("anatomy", 1), CARM.camera, 1.0, PLAIN) is None
-    weights = believed(unsure, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, PLAIN)
+    assert believed(unsure, TRUTH, ALL, ("anatomy", 1), CARM.camera, 1.0, None) is None
+    weights = believed(unsure, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, None)
     assert weights is not None
     assert weights.min() >= 0
     assert weights.max() <= 1

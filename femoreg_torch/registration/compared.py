@@ -1,0 +1,91 @@
+"""What is compared with what a stage draws: an image at a level, what is exposed of it, and a veil over it.
+
+A veil is light of the image of the same view without the device. Scattered light fills the shadows of metal. Where a
+grid, software or a simulator leaves little of it, the logarithm of a shadow is deep and mostly noise, and drowns what
+the edges of the shadow say. Then a share of the image without the device is added to the image with it. Both show one
+patient from one place, so that no shadow is deeper than that share of the light beside it. To what is drawn the same
+share of what is drawn without the device is added.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import Camera, Poses
+from femoreg_torch.registration.imaging import draw
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.scene import Kind, Scene
+from femoreg_torch.similarity import FixedSimilarity, Similarity, against_field
+
+
+@dataclass(frozen=True, eq=False)
+class Veil:
+    """An image with light added, and the light to add to what is drawn for it."""
+
+    image: Tensor  # (H, W) attenuation
+    light: Tensor  # (H, W), per primary light but for what is drawn
+    exposed: Tensor | None  # (H, W), bool: what no shutter shades in either image; None for all
+
+
+def veil_over(
+    scene: Scene,
+    poses: Poses,
+    render: Sequence[str],
+    image: tuple[Kind, int],
+    camera: Camera,
+    level: Level,
+    share: float,
+    scatter: float,
+) -> Veil | None:
+    """The veil of a `share` over an image (kind, view) at a level, whose grid is that of `camera`.
+
+    It is drawn once, with the objects of `render` at `poses`, and `scatter` per primary light. None where the share is
+    nothing, or the image is of the first kind, which shows the patient alone, or there is none of that kind.
+    """
+    kind, view = image
+    patient = scene.first_kind, view
+    if share <= 0 or kind == scene.first_kind or not scene.there([scene.first_kind], [view]):
+        return None
+    names = scene.shown(render, scene.first_kind)
+    bones = torch.zeros(camera.shape, device=scene.device)
+    if names:
+        where = torch.stack([poses.camera_from(name)[view] for name in names])[None]
+        bones = draw([scene.objects[name] for name in names], where, camera, level.step_mm)[0]
+    shadow, beside = (level.image(scene.image(*one), scene.carm.camera) for one in (image, patient))
+    fields = [exposed_field(scene, one, level) for one in (image, patient)]
+    exposed = [field for field in fields if field is not None]
+    return Veil(
+        -((-shadow).exp() + share * (-beside).exp()).log(),
+        share * ((-bones).exp() + scatter),
+        torch.stack(exposed).all(0) if exposed else None,
+    )
+
+
+def exposed_field(scene: Scene, image: tuple[Kind, int], level: Level) -> Tensor | None:
+    """The pixels (H, W), bool, of a level that the shutters of an image (kind, view) leave whole; None without any."""
+    exposed = scene.field(*image)
+    return None if exposed is None else level.field(exposed, scene.carm.camera)
+
+
+def prepared(
+    scene: Scene,
+    image: tuple[Kind, int],
+    level: Level,
+    similarity: Similarity,
+    weights: Tensor | None = None,
+    veil: Veil | None = None,
+) -> FixedSimilarity:
+    """A similarity against an image (kind, view) at a level, by what is exposed; `weights` (H, W) are of its pixels.
+
+    With a `veil` it is against the veiled image. Raises `InputError` where nothing is left to compare.
+    """
+    kind, view = image
+    fixed = level.image(scene.image(kind, view), scene.carm.camera) if veil is None else veil.image
+    exposed = exposed_field(scene, image, level) if veil is None else veil.exposed
+    try:
+        return against_field(similarity, fixed, weights, exposed)
+    except InputError as error:
+        raise InputError(f"view {view + 1}, {kind} image: {error}") from error
