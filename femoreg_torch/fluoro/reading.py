@@ -27,6 +27,7 @@ _ITK_SUFFIXES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
 _PAGED_SUFFIXES = (".tif", ".tiff")
 _SCREEN_SUFFIXES = (".jpg", ".jpeg", ".bmp")  # what nobody stores intensities in
+LOOKS_LOG = "looks like logarithms already"  # what a file of fractions asks the case about
 _LOG_RANGE = (2.0, 20.0)  # of the greatest attenuation in an image: 45 cm of water at 60 keV are 9
 _MOST_PICTURE_BYTES = 2**28  # what the most pixels have as floats
 _GREY_STEPS = 12  # by which the colours of a grey JPEG may differ
@@ -110,7 +111,7 @@ def read_stored(path: Path, frames: Frames | None = None) -> StoredImage:
         raise InputError(f"{path}: every pixel is {lowest:g}, there is nothing to be seen. Choose another image.")
     if dicom is None:
         looks_log = lowest > -1 and _LOG_RANGE[0] < highest < _LOG_RANGE[1] and bool((image != image.round()).any())
-        return StoredImage(image, remarks=remarks, asks="looks like logarithms already" if looks_log else None)
+        return StoredImage(image, remarks=remarks, asks=LOOKS_LOG if looks_log else None)
     padding = None if dicom.padding is None else torch.from_numpy(dicom.padding)
     return StoredImage(image, dicom.intensity, dicom.tags, padding, remarks, dicom.asks)
 

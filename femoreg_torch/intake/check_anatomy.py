@@ -71,7 +71,10 @@ def check_bones(
     bones = bone_labels(labels, ct, table, anatomy, marks)
     found.facts.append(f"bones: {', '.join(bones.ids)}")
     for bone, ids in bones.absent.items():
-        found.warnings.append(f"no voxel of {path.name} carries the label {', '.join(map(str, ids))}, the {bone}")
+        numbers = ", ".join(map(str, ids))
+        found.warnings.append(
+            f"no voxel of {path.name} carries the label {numbers}, the {bone}: nothing is lost if the CT shows none"
+        )
     return bones
 
 

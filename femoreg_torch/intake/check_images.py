@@ -24,6 +24,7 @@ from femoreg_torch.case.parts import (
 )
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display, check_header, check_matches, read_stored, settled_intensity
+from femoreg_torch.fluoro.reading import LOOKS_LOG
 from femoreg_torch.geometry import CArm
 from femoreg_torch.intake.found import Found
 
@@ -106,6 +107,8 @@ def _check_image(path: Path, view: View, carm: CArm | None, where: str, read: di
     read[where] = stored.values
     found.warnings += [f"{path.name} {remark}" for remark in stored.remarks]
     found.attempt(lambda: settled_intensity(view.intensity, stored, f"{where}: {path.name}"))
+    if view.intensity == "raw" and stored.asks == LOOKS_LOG:
+        found.warnings.append(f"{path.name} {LOOKS_LOG}, but the case says `intensity: raw`: bone is to be dark in it")
     if carm is not None and view.display is not None:
         shown, camera = view.display, view.display.stored_camera(carm.camera)
         found.attempt(lambda: check_matches(stored.values, camera, f"{where}: it"))

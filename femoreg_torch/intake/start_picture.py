@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.case import Case, StartRecord
+from femoreg_torch.case.model import PlannedPath
 from femoreg_torch.drr import project
 from femoreg_torch.evaluation.colours import object_colours
 from femoreg_torch.evaluation.overlay import monitor_picture, paint_edges, small_field
@@ -49,7 +50,31 @@ def picture_of_start(case: Case, landmarks: Mapping[str, Tensor] | None = None) 
     poses = scene.start(None if record is None else record.camera1_from_object)
     panels = [_panel(case, scene, poses, kind) for kind in scene.images if scene.images[kind][0] is not None]
     models = [name for name, thing in case.objects.items() if thing.model is not None]
-    return StartPicture(np.hstack(panels), tuple(facts), hardly_shown(scene, poses, models))
+    warnings = (*hardly_shown(scene, poses, models), *path_out_of_view(case.plan, scene, poses))
+    return StartPicture(np.hstack(panels), tuple(facts), warnings)
+
+
+def path_out_of_view(plan: PlannedPath | None, scene: Scene, poses: Poses) -> tuple[str, ...]:
+    """That both ends of the planned path lie outside the first view, if they do, in words.
+
+    A picture that is mirrored, or taken for mirrored, starts on the patient's other side.
+    """
+    if plan is None or plan.object not in poses.camera1_from:
+        return ()
+    ends = torch.stack([plan.entry_point, plan.target])
+    pixels = project_points(scene.carm.camera, transform_points(poses.camera_from(plan.object)[0], ends))
+    if _in_picture(pixels, scene.carm.camera).any():
+        return ()
+    return (
+        f"plan: where the start puts the {plan.object}, entry point and target lie beside the picture of view 1. Does "
+        "it show the operated side, and are its pictures displayed as `display` says?",
+    )
+
+
+def _in_picture(pixels: Tensor, camera: Camera) -> Tensor:
+    """Which of the points (N, 2) in pixels lie in the picture, bool."""
+    last = pixels.new_tensor([camera.shape[1] - 1, camera.shape[0] - 1])
+    return ((pixels >= 0) & (pixels <= last)).all(1)
 
 
 def hardly_shown(scene: Scene, poses: Poses, names: Sequence[str]) -> tuple[str, ...]:
@@ -61,10 +86,7 @@ def hardly_shown(scene: Scene, poses: Poses, names: Sequence[str]) -> tuple[str,
         volume = scene.objects[name].volume
         inside = (volume.data > volume.data.max() / 2).nonzero().cpu().flip(1).double()
         points = transform_points(poses.camera_from(name)[0] @ volume.lps_from_index, inside)
-        rows, columns = scene.carm.camera.shape
-        pixels = project_points(scene.carm.camera, points)
-        last = pixels.new_tensor([columns - 1, rows - 1])
-        share = float(((pixels >= 0) & (pixels <= last)).all(1).double().mean())
+        share = float(_in_picture(project_points(scene.carm.camera, points), scene.carm.camera).double().mean())
         if share < _LEAST_SHOWN:
             found.append(
                 f"{name}: where it is meant to stand, {share:.0%} of it lies in the picture of view 1. If the images "

@@ -311,3 +311,18 @@ def test_few_landmarks_are_a_warning(files: Path, tmp_path: Path) -> None:
     checked = check_case(folder, find_start=False)
     assert sum("landmarks: 3 of them; with fewer than 4 the start" in warning for warning in checked.warnings) == 1
     assert checked.problems == ()
+
+
+def test_logarithms_that_the_case_takes_for_intensities_are_a_warning(files: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    shown = np.random.default_rng(1).uniform(0.5, 6, (48, 40)).astype(np.float32)
+    cv2.imwrite(str(folder / "view1.tif"), shown)
+    content = case_content()
+    content["views"][0] |= {"anatomy": "view1.tif", "intensity": "raw"}
+    write_content(folder, content)
+    told = "view1.tif looks like logarithms already, but the case says `intensity: raw`: bone is to be dark in it"
+    assert told in check_case(folder, find_start=False).warnings
+    content["views"][0]["intensity"] = "log"
+    write_content(folder, content)
+    assert told not in check_case(folder, find_start=False).warnings
