@@ -8,7 +8,6 @@ from femoreg_torch.fluoro import natural
 from femoreg_torch.geometry import Poses, pose_difference
 from femoreg_torch.registration.device_fit import fit_device
 from femoreg_torch.registration.scene import Kind, Scene
-from femoreg_torch.registration.shadows import HARDENING
 
 _MOST_DEG, _MOST_MM = 8.0, 12.0  # that the device may move; more means that the images do not show it as it is
 
@@ -45,12 +44,12 @@ class Calibration:
                 told.append(f"{name} not estimated, as it would have moved by {deg:.0f}° and {mm:.0f} mm")
                 continue
             unsure = tuple(difference.to(scene.device) for difference in fit.unsure)
-            found = replace(thing, volume=fit.volume.to(scene.device), hardening=HARDENING, unsure=unsure)
+            found = replace(thing, volume=fit.volume.to(scene.device), hardening=fit.hardening, unsure=unsure)
             objects = scene.objects | {name: found}
             scene = replace(scene, objects=objects, scatter=scene.scatter or fit.scatter)
             poses = poses.with_object(name, fit.camera1_from)
             moving.append(name)
-            told.append(f"{name}: {', '.join(f'{a:.2f}' for a in fit.attenuations)}/mm")
+            told.append(f"{name}: {', '.join(f'{a:.2f}' for a in fit.attenuations)}/mm, hardening {fit.hardening:.2f}")
             if fit.scatter is not None:
                 told.append(f"scattered light {fit.scatter:.2f} of the primary")
             cost, evaluations = fit.misfit, evaluations + fit.evaluations

@@ -25,11 +25,13 @@ from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.registration.shadows import (
     LEAST_PIXELS,
     LEVEL,
+    TURN,
     TWIST,
     Device,
     View,
     device_of,
     first_guess,
+    hardening_of,
     residuals,
     scatter_of,
     solve,
@@ -57,6 +59,7 @@ class DeviceFit:
     misfit: float  # median difference of the logarithms of intensity
     evaluations: int
     unsure: tuple[Volume, ...]  # see `RigidObject`: blocks at the borders of materials, taken for the wrong one
+    hardening: float  # of the beam, see `imaging.hardened`
 
 
 def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit | None:
@@ -66,7 +69,7 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
     borders = None
     if thing.materials_known and len(thing.parts) > 1:
         owner, attenuation = _told(thing.parts)
-        device = device_of(name, kind, share, owner, len(attenuation), told=attenuation)
+        device = device_of(name, kind, share, owner, len(attenuation), told=attenuation, sharp=thing.sharp)
         seen = views_of(scene, poses, device)
         if not seen:
             return None
@@ -83,7 +86,8 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
         material, attenuation = materials(fit[:count], np.bincount(blocks[blocks >= 0].numpy(), minlength=count))
         fit = np.concatenate([attenuation, fit[count:]])
         borders = Borders(blocks, material, touching) if len(attenuation) > 1 else None
-        device = device_of(name, kind, share, torch.from_numpy(np.append(material, -1))[blocks], len(attenuation))
+        owner = torch.from_numpy(np.append(material, -1))[blocks]
+        device = device_of(name, kind, share, owner, len(attenuation), sharp=thing.sharp)
         evaluations += used
     poses, fit, seen, used = _settled(scene, poses, device, fit, seen)
     attenuation = fit[: device.regions]
@@ -98,6 +102,7 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
         float(np.median(misfit)),
         evaluations + used,
         () if borders is None else mistakes(share, borders, attenuation),
+        hardening_of(fit),
     )
 
 
@@ -135,12 +140,12 @@ def _settled(
         seen = views_of(scene, poses, device, [view.view for view in seen], volume)
         fit, used = solve(seen, device, fit, _FEWER)
         evaluations += used
-        still = (np.abs(fit[-6:]) < _STILL).all()
+        still = (np.abs(fit[TURN]) < _STILL).all()
         pose = poses.camera1_from[device.name]
         centre = transform_points(pose, scene.objects[device.name].reference_point[None])[0]
-        motion = about_point(exp_se3(torch.from_numpy(fit[-6:] * TWIST)[None]), centre)[0]
+        motion = about_point(exp_se3(torch.from_numpy(fit[TURN] * TWIST)[None]), centre)[0]
         poses = poses.with_object(device.name, motion @ pose)
-        fit[-6:] = 0
+        fit[TURN] = 0
         if still and number >= _FEWEST_ROUNDS:
             break
     return poses, fit, seen, evaluations

@@ -6,7 +6,8 @@ and I_d be their intensities and S the light that is scattered into a pixel; the
     I_d = g · ((Iₐ − S) · (1 + h Σ a ℓ)^(−1/h) + S)
 
 with the path ℓ through each region of the device, its attenuation a where it is thin, a factor g between the exposures,
-and the hardening h of the beam in it (`registration.imaging.hardened`). The additive scatter is that of Seibert and
+and the hardening h of the beam in it (`registration.imaging.hardened`), which the images tell as well: a tube's light
+hardens, that of a simulator of one energy does not. The additive scatter is that of Seibert and
 Boone, X-ray scatter removal by deconvolution, Med Phys 15 (1988) 567. Where metal is opaque the shadow is S, whatever
 the metal, so that its darkest places tell S, and lighter ones the attenuation. This least squares is sparse and runs on
 the CPU, with SciPy, wherever the scene lies.
@@ -34,8 +35,10 @@ LEAST_PIXELS = 100  # of a view that counts
 TWIST = np.array([0.01] * 3 + [1.0] * 3)  # rad and mm: one unit of the pose
 # Squared coefficient of variation of metal's attenuation over the spectrum of a tube at 75 kV, behind 200 mm of water:
 # 0.35, by the tables of `volume.materials`, 0.22 at 60 kV and 0.5 at 100 kV. Thick metal, which lets the hardest light
-# through, hardens the beam by less than the law of `hardened` says: 5 mm of steel as if it were 0.1. Between the two.
-HARDENING = 0.2
+# through, hardens the beam by less than the law of `hardened` says: 5 mm of steel as if it were 0.1. Between the two,
+# until the images tell it.
+_HARDENING, _HARDENING_DEVIATION = 0.2, 0.1
+_LEAST_HARDENING, _MOST_HARDENING = 0.01, 0.6  # next to one energy, and beyond a tube of 100 kV
 _LEAST_PATH_MM = 0.3  # of a ray through the device, for its pixel to count
 _AROUND_MM = 3.0  # on the detector: pixels beyond the shadow that count, so that the device may move
 _FAINTEST = 1e-3  # 1/mm
@@ -44,9 +47,11 @@ _VARIATION = 5.0  # weight of a step of 1/mm between all blocks
 _FLAT = 0.01  # 1/mm: steps that are none
 _TOLD_WITHIN = 0.3  # deviation of the logarithm of what a named material attenuates; nobody tells the tube's voltage
 _TOLD_WEIGHT = 1 / 200  # of one named material beside all pixels, whose misfits are alike over wide regions
+_HARDENING_WEIGHT = 1 / 50  # of the common tube beside them; with 1/200 named devices were placed less well
 _MISFIT = 0.05  # of a logarithm of intensity; larger ones (something else has changed) count less
 _LEAST_PASSING = 1e-3  # of 1 + h Σ a ℓ, where a motion of the device takes its path below nothing
 _CORNERS = 4  # of the box around the device: scattered light is interpolated between them
+_AT_HARDENING, TURN = -7, slice(-6, None)  # where hardening and twist stand among the parameters, see `solve`
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +66,7 @@ class Device:
     voxels: RegionVoxels
     touching: Indices | None  # (n, 3): pairs of regions, and the faces between them
     told: Doubles | None  # (regions,) attenuations that the case names
+    sharp: bool  # whether it is of solids with surfaces, so that the length of every path is known
 
     def filled(self, attenuation: Doubles) -> Volume:
         """Its attenuation, 1/mm, from that of its regions."""
@@ -76,8 +82,10 @@ def device_of(
     regions: int,
     touching: Indices | None = None,
     told: Doubles | None = None,
+    *,
+    sharp: bool = False,
 ) -> Device:
-    return Device(name, kind, share, owner, regions, region_voxels(share, owner, regions), touching, told)
+    return Device(name, kind, share, owner, regions, region_voxels(share, owner, regions), touching, told, sharp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +144,7 @@ def views_of(
 def first_guess(seen: list[View], attenuation: Doubles) -> Doubles:
     """Parameters, see `solve`, with these attenuations, and scatter that leaves the darkest pixels some light."""
     scatter = np.repeat([0.7 * _darkest(view) for view in seen], _CORNERS)
-    return np.concatenate([attenuation, scatter, np.zeros(len(seen) + 6)])
+    return np.concatenate([attenuation, scatter, np.zeros(len(seen)), [_HARDENING], np.zeros(6)])
 
 
 def _darkest(view: View) -> float:
@@ -145,31 +153,38 @@ def _darkest(view: View) -> float:
 
 
 def solve(seen: list[View], device: Device, begin: Doubles, iterations: int) -> tuple[Doubles, int]:
-    """Attenuations (K), scattered light (4 V), log factors between the exposures (V), a twist (6); and evaluations.
+    """Attenuations (K), scattered light (4 V), log factors between exposures (V), hardening, a twist (6); evaluations.
 
     Least squares of the logarithms of intensity, robust, plus, over the faces between `touching` regions, the total
     variation of the attenuation, as a device is of few materials (Rudin, Osher, Fatemi, Physica D 60 (1992) 259), and
-    how far the attenuations are from those that the case names.
+    how far the attenuations are from those that the case names, and the hardening from that of a common tube. The
+    hardening stays what it is where something else could take its place: attenuations of `touching` regions, the shape
+    of what is not `sharp`, or the depth of what one view shows.
     """
     views, regions, touching = len(seen), device.regions, device.touching
     darkest = np.repeat([_darkest(view) for view in seen], _CORNERS)
-    unit = np.concatenate([np.ones(regions), darkest, np.ones(views + 6)])
-    highest = np.concatenate([np.full(regions, _MOST_ATTENUATION), np.inf * darkest, np.full(views, 0.5), [3.0] * 6])
-    lowest = np.concatenate([np.zeros(regions + len(darkest)), -highest[-views - 6 :]])
+    unit = np.concatenate([np.ones(regions), darkest, np.ones(views + 1 + 6)])
+    held = begin[_AT_HARDENING]
+    free = touching is None and device.sharp and views > 1
+    softest, hardest = (_LEAST_HARDENING, _MOST_HARDENING) if free else (held, held)
+    exposures, turns = np.full(views, 0.5), np.full(6, 3.0)
+    highest = np.concatenate([np.full(regions, _MOST_ATTENUATION), np.inf * darkest, exposures, [hardest], turns])
+    lowest = np.concatenate([np.zeros(regions + len(darkest)), -exposures, [softest], -turns])
     count = max(1, sum(len(view.with_it) for view in seen))
 
     def cost(y: Doubles) -> tuple[float, Doubles]:
         x = y * unit
         value, slope = 0.0, np.zeros_like(x)
         for n, view in enumerate(seen):
-            residual, by_path, by_scatter = residuals(x, seen, n, regions)
+            residual, by_path, by_scatter, by_hardening = residuals(x, seen, n, regions)
             root = np.sqrt(1 + (residual / _MISFIT) ** 2)
             value += (root - 1).sum() / count
             push = residual / root / (_MISFIT**2 * count)
             slope[:regions] += view.paths.T @ (push * by_path)
             slope[scatter_of(n, regions)] += (push * by_scatter) @ view.corners
             slope[regions + _CORNERS * views + n] -= push.sum()
-            slope[-6:] += (push * by_path) @ view.changes
+            slope[_AT_HARDENING] += push @ by_hardening
+            slope[TURN] += (push * by_path) @ view.changes
         if touching is not None and len(touching):
             one, other, faces = touching.T
             step = x[one] - x[other]
@@ -178,6 +193,9 @@ def solve(seen: list[View], device: Device, begin: Doubles, iterations: int) -> 
             value += (share * (soft - _FLAT)).sum()
             np.add.at(slope, one, share * step / soft)
             np.add.at(slope, other, -share * step / soft)
+        away = (x[_AT_HARDENING] - _HARDENING) / _HARDENING_DEVIATION
+        value += 0.5 * _HARDENING_WEIGHT * away**2
+        slope[_AT_HARDENING] += _HARDENING_WEIGHT * away / _HARDENING_DEVIATION
         if device.told is not None:
             off = np.log(np.maximum(x[:regions], _FAINTEST) / device.told) / _TOLD_WITHIN
             value += 0.5 * _TOLD_WEIGHT * (off**2).sum()
@@ -195,6 +213,11 @@ def scatter_of(n: int, regions: int) -> slice:
     return slice(regions + _CORNERS * n, regions + _CORNERS * (n + 1))
 
 
+def hardening_of(x: Doubles) -> float:
+    """The hardening among the parameters."""
+    return float(x[_AT_HARDENING])
+
+
 def _corners(pixels: Indices, camera: Camera) -> Doubles:
     """Shares (N, 4) of the corners of the box around pixels, by bilinear interpolation."""
     if not len(pixels):
@@ -205,15 +228,17 @@ def _corners(pixels: Indices, camera: Camera) -> Doubles:
     return np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v], 1)
 
 
-def residuals(x: Doubles, seen: list[View], n: int, regions: int) -> tuple[Doubles, Doubles, Doubles]:
-    """Differences of the logarithms of intensity (N,) of view n, and their derivatives by Σ a ℓ and by S."""
+def residuals(x: Doubles, seen: list[View], n: int, regions: int) -> tuple[Doubles, Doubles, Doubles, Doubles]:
+    """Differences of the logarithms of intensity (N,) of view n, and their derivatives by Σ a ℓ, by S and by h."""
     view = seen[n]
     gain = x[regions + _CORNERS * len(seen) + n]
     scatter = view.corners @ x[scatter_of(n, regions)]
-    integrals = view.paths @ x[:regions] + view.changes @ x[-6:]
-    passing = np.maximum(1 + HARDENING * integrals, _LEAST_PASSING)
-    light = passing ** (-1 / HARDENING)
+    integrals = view.paths @ x[:regions] + view.changes @ x[TURN]
+    h = hardening_of(x)
+    passing = np.maximum(1 + h * integrals, _LEAST_PASSING)
+    light = passing ** (-1 / h)
     primary = np.maximum(view.without - scatter, 1e-3 * view.without)
     total = primary * light + scatter
     by_path = primary * light / passing / total
-    return np.log(view.with_it) - gain - np.log(total), by_path, -(1 - light) / total
+    by_hardening = -primary * light * (np.log(passing) / h - integrals / passing) / (h * total)
+    return np.log(view.with_it) - gain - np.log(total), by_path, -(1 - light) / total, by_hardening

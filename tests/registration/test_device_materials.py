@@ -22,6 +22,7 @@ from femoreg_torch.registration.regions import (
     touching_faces,
 )
 from femoreg_torch.registration.scene import RigidObject, Scene
+from femoreg_torch.registration.shadows import device_of, first_guess, hardening_of, residuals, views_of
 from femoreg_torch.volume import Volume, axis_aligned, voxelise_mesh
 
 CARM = CArm(centred_camera(1000.0, (1.5, 1.5), (160, 160)), (0.0, 0.0, 600.0), (0.0, 1.0, 0.0))
@@ -59,7 +60,9 @@ def poses(motion: torch.Tensor | None = None) -> Poses:
     return Poses(CARM.orbit(angles), {"body": body, "device": device})
 
 
-def make_scene(rod: float, handle: float, tissue_from: float = -118.0, brightest: float = 2.0) -> Scene:
+def make_scene(
+    rod: float, handle: float, tissue_from: float = -118.0, brightest: float = 2.0, spectrum: np.ndarray = SPECTRUM
+) -> Scene:
     """A block of tissue, and before it the device: intensities with a constant scatter, rays four times as fine.
 
     The tissue begins at x = `tissue_from`; the detector saturates at `brightest`.
@@ -72,7 +75,7 @@ def make_scene(rod: float, handle: float, tissue_from: float = -118.0, brightest
         body = project(block, truth.camera_from("body")[view][None], fine, 1.0)[0]
         metal = project(ROD, truth.camera_from("device")[view][None], fine, 0.2)[0]
         light = project(HANDLE, truth.camera_from("device")[view][None], fine, 0.2)[0]
-        through = torch.stack([torch.exp(-share * rod * metal) for share in SPECTRUM.tolist()]).mean(0)
+        through = torch.stack([torch.exp(-share * rod * metal) for share in spectrum.tolist()]).mean(0)
         for images, device in ((alone, torch.ones_like(metal)), (together, through * torch.exp(-handle * light))):
             intensity = (torch.exp(-body) * device + SCATTERED).clamp_max(brightest)
             images.append(-torch.nn.functional.avg_pool2d(intensity[None], 4)[0].log())
@@ -111,6 +114,56 @@ def test_material_and_pose_of_a_device_that_is_told_as_one_solid(mixed: Scene) -
         assert float(difference.data.abs().max()) > 0
     assert fit.scatter is not None
     assert fit.scatter == pytest.approx(SCATTERED, rel=0.35)
+
+
+def test_the_images_tell_how_much_metal_hardens_the_beam() -> None:
+    """Light of one energy, and of spectra whose squared coefficients of variation are 0.23 and 0.45."""
+    wide = scipy.stats.gamma(2, scale=0.5).ppf(np.arange(0.025, 1, 0.05))
+    found = []
+    for spectrum in (np.ones(1), SPECTRUM, wide):
+        scene = make_scene(0.4, 0.4, spectrum=spectrum)
+        scene = replace(scene, objects=scene.objects | {"device": replace(scene.objects["device"], sharp=True)})
+        after, record = Calibration("materials").calibrate(scene, poses())
+        hardening = after.objects["device"].hardening
+        assert f"hardening {hardening:.2f}" in record.stop
+        found.append(hardening)
+    one_energy, narrow, broad = found
+    assert one_energy < 0.08
+    assert one_energy + 0.05 < narrow < broad
+
+
+def test_hardening_is_not_asked_of_one_view_or_of_what_has_no_surfaces() -> None:
+    scene = make_scene(0.4, 0.4, spectrum=np.ones(1))
+    solid = replace(scene.objects["device"], sharp=True)
+    alone = {"anatomy": scene.images["anatomy"], "device": (scene.images["device"][0], None, None)}
+    sharp = replace(scene, objects=scene.objects | {"device": solid})
+    found = [fit_device(of, poses(), "device", "device") for of in (scene, replace(sharp, images=alone), sharp)]
+    unsharp, one_view, all_views = (fit.hardening for fit in found if fit is not None)
+    assert unsharp == one_view == 0.2 != all_views
+
+
+def test_residuals_have_the_derivatives_that_they_say(mixed: Scene) -> None:
+    """By central differences, of one material in one view."""
+    share = mixed.objects["device"].volume
+    share = share.with_data(share.data / share.data.max())
+    owner = torch.where(share.data > 0, 0, -1)
+    device = device_of("device", "device", share, owner, 1)
+    seen = views_of(mixed, poses(), device)[:1]
+    x = first_guess(seen, np.array([0.3]))
+    value, by_path, by_scatter, by_hardening = residuals(x, seen, 0, 1)
+    step = 1e-5
+
+    def slope(at: int) -> np.ndarray:
+        up, down = x.copy(), x.copy()
+        up[at] += step
+        down[at] -= step
+        return (residuals(up, seen, 0, 1)[0] - residuals(down, seen, 0, 1)[0]) / (2 * step)
+
+    assert np.abs(value).max() > 0.1
+    np.testing.assert_allclose(slope(0), by_path * seen[0].paths.toarray()[:, 0], rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(slope(1), by_scatter * seen[0].corners[:, 0], rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(slope(-7), by_hardening, rtol=1e-4, atol=1e-7)
+    assert hardening_of(x) == x[-7] > 0
 
 
 def test_a_device_that_is_as_the_case_says_stays_so() -> None:
