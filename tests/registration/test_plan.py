@@ -74,9 +74,12 @@ def test_the_paper_preset_is_the_papers() -> None:
     plan = load_plan("paper")
     (orbit,) = (step for step in plan.steps if isinstance(step, OrbitSearch))
     assert (orbit.half_range_deg, orbit.step_deg) == (45, 0.5)
-    for step in (*plan.stages, orbit):
+    *stages, last = plan.stages
+    for step in (*stages, orbit):
         assert step.level.pixel_mm == 0.78
         assert step.similarity == GradNcc(patch_radius=10)
+    assert last.level.pixel_mm == 0.78
+    assert last.similarity == GradNcc(patch_radius=5)  # smaller, as the preset's comment tells
     (materials,) = (step for step in plan.steps if isinstance(step, Calibration))  # the one that is not
     assert plan.steps.index(materials) == len(plan.steps) - 2
     assert all(isinstance(stage.optimiser, Bobyqa) for stage in plan.stages if len(stage.bodies) > 1)
