@@ -4,11 +4,16 @@ The poses are where the scores of all image tiles cancel. Were the images drawn 
 by G = Σ s sᵀ, and the poses by H⁻¹ G H⁻¹ with the curvature H: the sandwich estimator with tiles as clusters (White,
 Maximum likelihood estimation of misspecified models, Econometrica 50 (1982) 1; Cameron and Miller, A practitioner's
 guide to cluster-robust inference, J. Human Resources 50 (2015) 317). It assumes neither a noise model nor independent
-pixels, only tiles that do not know of each other. What all tiles share (a wrong CT) it cannot see.
+pixels, only tiles that do not know of each other. What all tiles share (a wrong CT) it cannot see. The images of one
+view, without and with the device, show the same bones with the same mistakes of the CT: the scores of their tiles at
+one place are summed before they are squared, as one cluster. On four simulated procedures such tiles had scores whose
+correlation was 0.5 to 0.97 by what moves the bones; taken as independent, 300 procedures' errors of the femur were 1.06
+to 1.34 of its deviations in the root mean square.
 
-The C-arm's intrinsics q are nuisance parameters with a prior of covariance 1 in their units. Refitted to other
-intrinsics, the poses would answer by J = −Hxx⁻¹ Hxq. What remains of the images with the poses refitted, S = Hqq +
-Hqx J with scores r = s_q + Jᵀ s_x, informs of q by S R⁻¹ S with R = Σ r rᵀ, the inverse of their own sandwich. With the
+The C-arm's intrinsics q are nuisance parameters with a prior of covariance 1 in their units. Of them the tiles of every
+image count by themselves, and the limits of what is doubted were chosen so. Refitted to other intrinsics, the poses
+would answer by J = −Hxx⁻¹ Hxq. What remains of the images with the poses refitted, S = Hqq + Hqx J with scores
+r = s_q + Jᵀ s_x, informs of q by S R⁻¹ S with R = Σ r rᵀ, the inverse of their own sandwich. With the
 prior this gives a mean m and a covariance P of q. The intrinsics q0 that the poses were found with are off by
 P + (m − q0)(m − q0)ᵀ in the mean square, and the covariance of the poses is Hxx⁻¹ G Hxx⁻¹ + J (P + …) Jᵀ. So
 intrinsics that were refined count with what the images leave open, and others also with how badly the images fit them.
@@ -149,8 +154,9 @@ def pose_covariance(
     inverse = torch.linalg.pinv(model.hessian[:rigid, :rigid], hermitian=True)
     by_materials = inverse @ every.hessian[:rigid, len(model.hessian) :]
     clusters = len(model.scores) / (len(model.scores) - 1)
-    scores = model.scores[:, :rigid]
-    by_images = clusters * inverse @ (scores.T @ scores) @ inverse + by_materials @ by_materials.T
+    scores = _by_place(parts, [view for _, view in images])[:, :rigid]
+    of_places = len(scores) / (len(scores) - 1)
+    by_images = of_places * inverse @ (scores.T @ scores) @ inverse + by_materials @ by_materials.T
     of_intrinsics = profile(model, refined)
     mean, spread = _estimate(of_intrinsics, clusters, refined)
     response = of_intrinsics.answer + _slides(refined, poses, bodies)
@@ -175,6 +181,19 @@ def pose_covariance(
 def _first(model: Quadratic, n: int) -> Quadratic:
     """A model of its first n unknowns, the others staying as they are."""
     return Quadratic(model.value, model.scores[:, :n], model.hessian[:n, :n])
+
+
+def _by_place(parts: Sequence[Quadratic], views: Sequence[int]) -> Tensor:
+    """Scores (T, n) of the mean of images, those of one view's images at the same tile summed; `views` has theirs.
+
+    An image that nothing moves in has one tile, without a score.
+    """
+    found = []
+    for view in dict.fromkeys(views):
+        of_view = [part.scores / len(parts) for part, where in zip(parts, views, strict=True) if where == view]
+        tiles = max(len(scores) for scores in of_view)
+        found.append(torch.stack([scores for scores in of_view if len(scores) == tiles]).sum(0))
+    return torch.cat(found)
 
 
 def _estimate(images: Profile, clusters: float, refined: Intrinsics) -> tuple[Tensor, Tensor]:

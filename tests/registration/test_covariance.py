@@ -109,3 +109,16 @@ def test_what_is_unsure_of_a_device_counts_as_what_it_does_to_its_pose() -> None
     assert float(added @ step) > 0.9 * float(added.norm() * step.norm())
     pelvis = 6 * known.bodies.index("pelvis")
     assert (unsure.images - known.images).diagonal()[pelvis : pelvis + 5].max() < 1e-3  # depth is common to all
+
+
+def test_bones_seen_twice_by_the_same_image_are_known_no_better() -> None:
+    """What a CT has wrong is wrong in both images of a view: a second one with the same mistakes tells nothing new."""
+    scene = make_scene(true_poses(), noise=0.02)
+    bones = {name: thing for name, thing in scene.objects.items() if name != "device"}
+    twice = {name: replace(thing, shown_in=("anatomy", "again")) for name, thing in bones.items()}
+    truth = Poses(true_poses().camera_from_camera1, {name: true_poses().camera1_from[name] for name in bones})
+    images = scene.images["anatomy"]
+    once = replace(scene, objects=bones, images={"anatomy": images})
+    again = replace(scene, objects=twice, images={"anatomy": images, "again": images})
+    first, second = (pose_covariance(each, truth, _LEVEL, _SIMILARITY) for each in (once, again))
+    torch.testing.assert_close(second.images, first.images)
