@@ -22,7 +22,8 @@ Intensity = Literal["raw", "log"]  # raw: bone dark, as a detector counts; log: 
 class Start:
     """How an object starts: at a nominal pose, beside another object, or, with neither, where landmarks put it.
 
-    Two structures of one CT have one space, so that beside one another they start where the CT has them.
+    Two structures of one CT have one space, so that beside one another they start where the CT has them. With both, the
+    search starts at the pose, and the place beside the other object is what is expected.
     """
 
     camera1_from: Tensor | None = None  # (4, 4) nominal pose in camera 1
@@ -32,8 +33,9 @@ class Start:
     @property
     def nominal(self) -> bool:
         """Whether it is where something is meant to be, and not where the CT has it."""
-        moved = not torch.equal(self.beside_from_object, torch.eye(4, dtype=torch.float64))
-        return self.camera1_from is not None or (self.beside is not None and moved)
+        if self.beside is None:
+            return self.camera1_from is not None
+        return not torch.equal(self.beside_from_object, torch.eye(4, dtype=torch.float64))
 
     @property
     def by_landmarks(self) -> bool:

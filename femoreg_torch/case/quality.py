@@ -27,6 +27,7 @@ class ObjectQuality:
     displacement: tuple[float, float] | None  # degrees, mm from where it was expected, at the reference point
     trusted: bool
     reason: str
+    turn_told: bool = True  # False for a round object, whose turn about its own axis no image tells
 
 
 @dataclass(frozen=True)

@@ -273,6 +273,7 @@ def _object_quality(fields: Fields, count: int) -> ObjectQuality:
         displacement=None if displacement is None else (displacement[0], displacement[1]),
         trusted=fields.content.get("trusted") is True,
         reason=reason if isinstance(reason, str) else "no reason given",
+        turn_told=fields.content.get("turn_told") is not False,
     )
 
 

@@ -19,17 +19,25 @@ def navigation_content(result: Result, robot: Robot | None) -> dict[str, Any]:
     """Everything that `navigation.json` holds, as tensors, mm; in the robot's base too if its calibration is there.
 
     Keys are named after the object with the planned path and its tool: `femur_from_device`, `in_femur`, `in_device`.
+    Of a round tool no image tells the turn about its own axis, so that no direction in its frame, or in the robot's
+    base, is known, and the content is not trusted. What is told in the frame of the object holds.
     Raises `InputError` if no tool was registered.
     """
     found = guide(result)
     name, tool = found.object, found.tool
+    reasons = list(result.verdict.reasons)
+    if tool in result.quality and not result.quality[tool].turn_told:
+        reasons.append(
+            f"the {tool} is round, and no image tells its turn about its own axis: directions in its frame, or in the "
+            f"robot's base, may be turned about it; those in the frame of the {name} hold"
+        )
     object_from_tool, correction = found.object_from_tool, found.correction
     content: dict[str, Any] = {
         "version": 1,
         "object": name,
         "tool": tool,
-        "trusted": result.verdict.trusted,
-        "reasons": result.verdict.reasons,
+        "trusted": not reasons,
+        "reasons": reasons,
         "skipped": result.skipped,
         "notice": NOTICE,
         "tip_offset_mm": found.tip_offset.norm(),

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 Objective = Callable[[Tensor], Tensor]  # deltas (P, n) in units of their scale -> values (P,), lower is better
@@ -58,7 +59,7 @@ class BestSoFar:
     def __call__(self, deltas: Tensor) -> Tensor:
         """Values (P,) of deltas (P, n)."""
         values = self._objective(deltas)
-        best = int(values.argmin())
+        best = int(values.nan_to_num(nan=torch.inf, posinf=torch.inf).argmin())
         self.evaluations += len(deltas) - 1
         self.count(deltas[best], float(values[best]))
         return values

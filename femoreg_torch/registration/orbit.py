@@ -92,7 +92,7 @@ def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> 
         for image in search.images(scene, poses, view)
     ]
     values = torch.stack(costs).mean(0).cpu()  # (N,)
-    best = int(values.argmin())
+    best = int(values.nan_to_num(nan=torch.inf, posinf=torch.inf).argmin())
     seconds = time.perf_counter() - began
     return StageRecord(
         search.name,

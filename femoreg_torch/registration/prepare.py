@@ -88,7 +88,7 @@ def prepare_scene(case: Case) -> Scene:
             thing.images or tuple(images),
             thing.start,
             parts=volumes.parts,
-            axis=round_axis(volumes.volume),
+            axis=round_axis(volumes.volume, volumes.parts, _named_points(thing).values()),
             materials_known=thing.model.materials_known,
             sharp=bool(thing.model.solids),
         )
@@ -115,10 +115,14 @@ def _check_path(case: Case, ct: Volume) -> None:
         check_inside({"entry_point of the plan": case.plan.entry_point, "target of the plan": case.plan.target}, ct)
 
 
+def _named_points(thing: CaseObject) -> dict[str, Tensor]:
+    """All points (3,) of an object that have a name, its reference too if it is given."""
+    return thing.points if thing.reference is None else {**thing.points, "reference": thing.reference}
+
+
 def _check_points(case: Case, thing: CaseObject, volume: Volume) -> None:
     """Raises `InputError` for a point (3,) of an object that lies nowhere near its model."""
-    named = thing.points if thing.reference is None else {**thing.points, "reference": thing.reference}
-    for name, point in named.items():
+    for name, point in _named_points(thing).items():
         beyond = volume.beyond_mm(point)
         if beyond > _MOST_BEYOND_MM:
             raise InputError(

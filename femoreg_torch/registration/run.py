@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 import femoreg_torch
-from femoreg_torch.case import Case, Result, Start, StartRecord
+from femoreg_torch.case import Case, Result, StartRecord
 from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.detect import detect, load_network
 from femoreg_torch.drr import CPU
@@ -94,6 +94,11 @@ def register(
             )
         for number, pose in enumerate(cameras):
             check_rigid(pose, f"camera_from_camera1[{number}]")
+        if not torch.allclose(cameras[0], torch.eye(4, dtype=torch.float64), atol=1e-6):
+            raise InputError(
+                "camera_from_camera1[0]: the identity was expected, as camera 1 is the frame of all poses. Give "
+                "every pose times the inverse of the first."
+            )
         scene = replace(prepare_scene(case), camera_from_camera1=cameras)
     return register_scene(
         case, scene, plan, seed=seed, find=find, landmarks=landmarks, start=start, device=device, report=report
@@ -198,7 +203,8 @@ def _started_at(scene: Scene, start: Mapping[str, Tensor]) -> Scene:
             raise InputError(
                 f"start: there is no object {shortened(name)} in this case; there are: {', '.join(objects)}."
             )
-        objects[name] = replace(objects[name], start=Start(camera1_from=check_rigid(pose.double(), f"start, {name}")))
+        given = check_rigid(pose.double(), f"start, {name}")
+        objects[name] = replace(objects[name], start=replace(objects[name].start, camera1_from=given))
     check_starts(objects, scene.carm.camera.sdd_mm, "start")
     return replace(scene, objects=objects)
 

@@ -227,6 +227,19 @@ def test_a_result_without_trust_says_so_everywhere(tmp_path: Path, capsys: pytes
     assert "Do not steer" not in capsys.readouterr().out
 
 
+def test_of_a_round_device_no_direction_in_its_frame_is_trusted(tmp_path: Path) -> None:
+    """Registered with another turn, the same needle would be told another way to go in the robot's base."""
+    run = write_run(tmp_path / "run")
+    written = json.loads((run / "result.json").read_text(encoding="utf-8"))
+    written["quality"]["device"]["turn_told"] = False
+    (run / "result.json").write_text(json.dumps(written), encoding="utf-8")
+    assert main(["navigate", str(run)]) == 0
+    content = json.loads((run / "navigation.json").read_text(encoding="utf-8"))
+    assert content["trusted"] is False
+    assert "round" in content["reasons"][0]
+    assert "NOT TRUSTED: the device is round" in (run / "navigation" / "correction_in_device.txt").read_text("utf-8")
+
+
 def test_a_result_that_does_not_speak_of_trust_has_none(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     content = json.loads((run / "result.json").read_text(encoding="utf-8"))

@@ -1,10 +1,13 @@
 """Every optimiser on problems of known minimum; seeds; reasons to stop."""
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from femoreg_torch.optimize import Bobyqa, CmaEs, Optimiser, Stop
+from femoreg_torch.optimize.result import BestSoFar
 
 MINIMUM = torch.tensor([0.3, -0.2, 0.5, 0.1, -0.4, 0.2], dtype=torch.float64)
 SETTINGS = [CmaEs(population=20, max_evaluations=4000), Bobyqa()]
@@ -82,3 +85,9 @@ def test_bobyqa_stays_in_its_box() -> None:
 def test_an_objective_that_is_never_finite_is_an_error(settings: Optimiser) -> None:
     with pytest.raises((ArithmeticError, ValueError, RuntimeError)):
         settings.minimise(lambda d: torch.full((len(d),), torch.nan, dtype=torch.float64), 2, seed=0)
+
+
+def test_a_nan_does_not_hide_the_finite_values_beside_it() -> None:
+    best = BestSoFar(lambda deltas: deltas[:, 0])
+    best(torch.tensor([[2.0], [math.nan], [0.5]], dtype=torch.float64))
+    assert best.result(Stop.BUDGET).value == 0.5

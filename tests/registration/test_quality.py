@@ -6,11 +6,20 @@ from dataclasses import replace
 import pytest
 import torch
 from registration_scenes import REFERENCE_POINTS, float64, make_scene, off, true_poses
+from torch import Tensor
 
 from femoreg_torch.case import Start
 from femoreg_torch.case.trace import Restart, StageRecord
-from femoreg_torch.registration.quality import Limits, _Judged, _unsettled, assess
-from femoreg_torch.registration.scene import Scene
+from femoreg_torch.drr import project
+from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
+from femoreg_torch.registration.imaging import PLAIN
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.quality import Limits, _Judged, _unsettled, _unturned, assess
+from femoreg_torch.registration.run import _started_at
+from femoreg_torch.registration.scene import RigidObject, Scene
+from femoreg_torch.registration.turns import loss_by_turning
+from femoreg_torch.similarity import GradNcc
+from femoreg_torch.volume import Volume, axis_aligned
 
 TRUTH = true_poses()
 LIMITS = Limits()
@@ -110,3 +119,54 @@ def test_a_pull_is_asked_beside_the_anchor_and_of_the_anchor_mostly_across(
     told = _unsettled("femur", judged, Limits())
     assert (told is None) is settled
     assert told is None or ("beside the pelvis" in told) is (beside is not None)
+
+
+def test_a_start_that_is_given_does_not_change_what_is_expected(scene: Scene) -> None:
+    """A femur out of its joint is told too where the search starts at poses of an earlier result."""
+    apart = off(TRUTH.camera1_from["femur"], REFERENCE_POINTS["femur"], (0, 0, 0), (0, 0, 9))
+    given = _started_at(scene, {"femur": apart})
+    assert torch.equal(given.start(TRUTH.camera1_from["pelvis"]).camera1_from["femur"], apart)
+    before, after = (
+        assess(each, TRUTH.with_object("femur", apart), LIMITS)["femur"].displacement for each in (scene, given)
+    )
+    assert before == after
+    assert before is not None
+    assert before[1] == pytest.approx(9.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("lost", "told"), [(0.2, True), (0.001, False), (-0.01, False), (math.nan, False)])
+def test_a_turn_that_costs_nothing_is_not_told(lost: float, told: bool) -> None:
+    assert (_unturned("device", lost, Limits()) is None) is told
+
+
+def test_a_device_is_turned_about_what_is_in_view(scene: Scene) -> None:
+    """A round guide with a handle: turning it costs much, but next to nothing where a shutter hides the handle."""
+    z, y, x = torch.meshgrid(*[torch.arange(n).double() for n in (120, 61, 61)], indexing="ij")
+    x, y, z = x - 30, y - 30, z - 20
+    guide = (x.hypot(y) < 5) & (z.abs() < 20)
+    handle = (x.abs() < 6) & (y.abs() < 28) & (z > 60) & (z < 95)
+    volume = Volume((0.2 * (guide | handle)).float(), axis_aligned((1.0, 1.0, 1.0), (-30, -30, -20)))
+    pose = TRUTH.camera1_from["device"]
+    poses = Poses(TRUTH.camera_from_camera1, {"probe": pose})
+    cameras = [scene.camera(poses, view) for view in range(scene.views)]
+    places = [poses.camera_from("probe")[view] for view in range(scene.views)]
+    images = tuple(project(volume, place[None], camera, 0.5)[0] for place, camera in zip(places, cameras, strict=True))
+    probe = RigidObject(volume, float64(0, 0, 0), ("device",), Start(pose), parts=(volume,), sharp=True)
+    whole = replace(scene, objects={"probe": probe}, images={"device": images}, tissue=None, outline=None)
+
+    def shown(place: Tensor, camera: Camera) -> Tensor:
+        """The pixels that look at no voxel of the handle, nor near it."""
+        points = transform_points(volume.lps_from_index, (volume.data * handle).nonzero().flip(1).double())
+        pixels = project_points(camera, transform_points(place, points)).round().long()
+        field = torch.ones(camera.shape, dtype=torch.bool)
+        low, high = pixels.amin(0) - 4, pixels.amax(0) + 5
+        field[max(0, int(low[1])) : max(0, int(high[1])), max(0, int(low[0])) : max(0, int(high[0]))] = False
+        return field
+
+    fields = tuple(shown(place, camera) for place, camera in zip(places, cameras, strict=True))
+    hidden = replace(whole, fields={"device": fields})
+    found, blind = (
+        loss_by_turning(each, poses, "probe", Level(3.0, 1.0), GradNcc(4), PLAIN) for each in (whole, hidden)
+    )
+    assert found > 0.05
+    assert blind < 0.01

@@ -97,3 +97,43 @@ def test_poses_of_a_round_object_are_as_far_apart_as_their_axes() -> None:
     tilted = torch.eye(4).double()
     tilted[:3, :3] = exp_so3(0.3 * tilt / tilt.norm())
     assert axis.difference(EYE, tilted @ turned)[0] == pytest.approx(math.degrees(0.3))
+
+
+@pytest.mark.parametrize(("slot", "round_"), [(False, True), (True, False)])
+def test_thin_walls_are_judged(slot: bool, round_: bool) -> None:
+    """A cannula of 0.8 mm wall, whole and with a slot of 4 mm."""
+    tube = solid("tube")
+    z, y, x = torch.meshgrid(*[0.5 * torch.arange(80, dtype=torch.float64)] * 3, indexing="ij")
+    away = torch.stack([x, y, z], -1) - MIDDLE
+    side = torch.linalg.cross(AXIS, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    u, v = away @ (side / side.norm()), away @ torch.linalg.cross(AXIS, side / side.norm())
+    radius, along = u.hypot(v), away @ AXIS
+    wall = (radius < 8) & (radius > 7.2) & (along.abs() < 12)
+    if slot:
+        wall &= ~((u > 0) & (v.abs() < 2))
+    assert (round_axis(tube.with_data(0.05 * wall.float())) is not None) is round_
+
+
+def test_a_point_off_the_axis_depends_on_the_turn() -> None:
+    rod = solid("rod")
+    side = torch.linalg.cross(AXIS, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    tip = MIDDLE + 60 * AXIS
+    assert round_axis(rod, points=[tip]) is not None
+    assert round_axis(rod, points=[tip, tip + 3 * side / side.norm()]) is None
+
+
+@pytest.mark.parametrize("where", ["beside", "both sides"])
+def test_what_is_round_outside_only_is_not_round(where: str) -> None:
+    """A rod of plastic with one wire beside its axis, or with two on opposite sides."""
+    rod, wire = solid("rod"), torch.zeros(80, 80, 80, dtype=torch.bool)
+    z, y, x = torch.meshgrid(*[0.5 * torch.arange(80, dtype=torch.float64)] * 3, indexing="ij")
+    away = torch.stack([x, y, z], -1) - MIDDLE
+    side = torch.linalg.cross(AXIS, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    u, v = away @ (side / side.norm()), away @ torch.linalg.cross(AXIS, side / side.norm())
+    for sign in (1, -1) if where == "both sides" else (1,):
+        wire |= ((u - 2.5 * sign).hypot(v) < 1) & ((away @ AXIS).abs() < 12)
+    whole = rod.with_data(rod.data + 0.3 * wire.float())
+    middle = rod.with_data(rod.data + 0.3 * ((u.hypot(v) < 1) & ((away @ AXIS).abs() < 12)).float())
+    assert round_axis(middle) is not None
+    assert round_axis(whole) is None
+    assert round_axis(rod, [rod.with_data(0.3 * wire.float())]) is None

@@ -13,6 +13,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import CArm, centred_camera, project_points, rotation_angle, transform_points
 from femoreg_torch.registration import RigidObject, Scene
+from femoreg_torch.registration.run import register
 from femoreg_torch.registration.start import find_start, start_by_detection, start_by_landmarks
 from femoreg_torch.volume import Volume, axis_aligned
 
@@ -101,3 +102,15 @@ def test_too_few_landmarks_by_hand_are_refused() -> None:
     pixels = {name: torch.zeros(2, dtype=torch.float64) for name in (*NAMES[:3], "knee", "ankle")}
     with pytest.raises(InputError, match="3 have the name of a landmark of the case"):
         start_by_landmarks(case, "pelvis", pixels)
+
+
+@pytest.mark.parametrize(
+    ("poses", "says"),
+    [
+        (POSE[None], r"camera_from_camera1\[0\]: the identity was expected, as camera 1 is the frame"),
+        (torch.eye(4, dtype=torch.float64).repeat(2, 1, 1), r"camera_from_camera1: \(1, 4, 4\) was expected"),
+    ],
+)
+def test_given_poses_of_the_c_arm_are_in_the_frame_of_camera_1(poses: torch.Tensor, says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        register(hip_case(), camera_from_camera1=poses)

@@ -1,0 +1,62 @@
+"""Do the images tell the turn of an object about its long axis, as far as they show it?
+
+Derivatives do not say so: voxels of a round guide are not quite round, and what that draws looks like knowledge of the
+turn. So the object is turned far, about the long axis of what is in view of it, and the similarity must fall.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.geometry import Poses, project_points, transform_points
+from femoreg_torch.registration.imaging import Imaging
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import image_costs
+from femoreg_torch.registration.scene import Body, Kind, Scene
+from femoreg_torch.similarity import Similarity
+
+_TURNS_DEG = -20.0, 20.0, 180.0
+_FILLED = 0.004  # 1/mm: a fifth of water
+_MOST_POINTS = 20_000
+
+
+def loss_by_turning(
+    scene: Scene, poses: Poses, name: str, level: Level, similarity: Similarity, imaging: Imaging
+) -> float:
+    """What the images lose of their mean similarity, at least, if an object is turned about its long axis.
+
+    Infinite where no image shows it. nan where a similarity is.
+    """
+    images = scene.there(scene.objects[name].shown_in, range(scene.views))
+    points = _in_view(scene, poses, name, images)
+    if len(points) < 2:
+        return math.inf
+    middle = points.mean(0)
+    moments, axes = torch.linalg.eigh((points - middle).T @ (points - middle))
+    long = axes[:, 2 if moments[2] - moments[1] > moments[1] - moments[0] else 0]
+    body = Body((name,), 0, middle, torch.tensor([math.pi / 180] * 3 + [0] * 3, dtype=torch.float64))
+    costs = image_costs(scene, poses, (body,), tuple(poses.camera1_from), images, level, similarity, imaging=imaging)
+    found = costs(torch.tensor([0, *_TURNS_DEG], dtype=torch.float64)[:, None] * long).mean(1)
+    return float((found[1:] - found[0]).min())
+
+
+def _in_view(scene: Scene, poses: Poses, name: str, images: Sequence[tuple[Kind, int]]) -> Tensor:
+    """Filled voxels (N, 3) of an object, mm in camera 1, that an exposed pixel of some image shows."""
+    volume = scene.objects[name].volume
+    places = (volume.data > _FILLED).nonzero().cpu()
+    places = places[:: 1 + len(places) // _MOST_POINTS]
+    points = transform_points(volume.lps_from_index, places.flip(1).double())
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for kind, view in images:
+        camera = scene.camera(poses, view)
+        pixels = project_points(camera, transform_points(poses.camera_from(name)[view], points)).round().long()
+        size = torch.tensor(camera.shape[::-1])
+        inside = ((pixels >= 0) & (pixels < size)).all(1)
+        field = scene.field(kind, view)
+        if field is not None:
+            column, row = pixels.clamp_min(0).minimum(size - 1).unbind(1)
+            inside &= field.cpu()[row, column]
+        seen |= inside
+    return transform_points(poses.camera1_from[name], points[seen])
