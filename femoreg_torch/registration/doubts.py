@@ -4,7 +4,7 @@ The C-arm's file, its poses, the plan, models that the images do not show as the
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import chain
 
 import torch
@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from femoreg_torch.case import Case
 from femoreg_torch.cores import on_all_cores
+from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Poses, orbit_angles, pose_difference, transform_points
 from femoreg_torch.registration.covariance import PoseCovariance
 from femoreg_torch.registration.handedness import handedness
@@ -66,8 +67,9 @@ def doubts(
 
     `told` is the scene as the case tells it, `scene` the one with what was estimated of the images.
     """
+    displays = [case.display_of(view) for view in range(len(case.views))]
     others: list[Callable[[], tuple[str, ...]]] = [
-        lambda: doubts_about_the_carm(scene, poses, covariance, limits),
+        lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
         lambda: doubts_about_motion(covariance),
         lambda: doubts_about_the_plan(case, scene),
@@ -81,8 +83,10 @@ def doubts(
     )
 
 
-def doubts_about_the_carm(scene: Scene, poses: Poses, covariance: PoseCovariance, limits: Limits) -> tuple[str, ...]:
-    """What the images say against the C-arm's file, in words; nan counts as that.
+def doubts_about_the_carm(
+    scene: Scene, poses: Poses, covariance: PoseCovariance, limits: Limits, displays: Sequence[Display]
+) -> tuple[str, ...]:
+    """What the images say against the C-arm's file, in words, as its views' pictures are stored; nan counts as that.
 
     A shift of all principal points is nearly a turn of the C-arm: images ask for a quarter of it. So where intrinsics
     were refined, a smaller shift is doubted as well. Where the images say little at the end, the estimate stays near
@@ -108,7 +112,7 @@ def doubts_about_the_carm(scene: Scene, poses: Poses, covariance: PoseCovariance
         )
     for view, shift in enumerate(mean[1:].view(-1, 2)):
         if not float(shift.abs().max()) <= limits.most_intrinsics_sigma:
-            x, y = shift_px(scene.carm, shift)
+            x, y = shift_px(scene.carm, displays[view], shift)
             doubts.append(
                 f"the images of view {view + 1} fit a principal point ({x:.0f}, {y:.0f}) pixels from where the C-arm's "
                 f"file says (± {uncertainty.principal_point_mm:.1f} mm): {advice}"

@@ -22,6 +22,7 @@ from femoreg_torch.case import Case
 from femoreg_torch.case.quality import CameraQuality, ObjectQuality, ViewQuality
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.cores import on_all_cores
+from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import CArm, Poses, pose_difference, transform_points
 from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
 from femoreg_torch.registration.imaging import PLAIN, Imaging
@@ -102,18 +103,21 @@ def final_covariance(scene: Scene, poses: Poses, imaging: Imaging = PLAIN) -> Po
     return pose_covariance(scene, poses, _LEVEL, _SIMILARITY, imaging)
 
 
-def assess_cameras(scene: Scene, poses: Poses, covariance: PoseCovariance) -> tuple[CameraQuality, ...]:
-    """The camera of every view, and how well it is known."""
+def assess_cameras(
+    scene: Scene, poses: Poses, covariance: PoseCovariance, displays: Sequence[Display]
+) -> tuple[CameraQuality, ...]:
+    """The camera of every view as its pictures are stored (`displays`), and how well it is known."""
     deviation = covariance.intrinsics.deviation
-    cameras = (scene.camera(poses, view) for view in range(len(poses.camera_from_camera1)))
+    cameras = [display.stored_camera(scene.camera(poses, view)) for view, display in enumerate(displays)]
+    shifts = [shift_px(scene.carm, display, deviation[1 + 2 * n : 3 + 2 * n]) for n, display in enumerate(displays)]
     return tuple(
         CameraQuality(
             camera.sdd_mm,
             camera.principal_point_px,
             float(deviation[0]) * scene.carm.assumed_uncertainty.sdd_percent / 100 * camera.sdd_mm,
-            shift_px(scene.carm, deviation[1 + 2 * view : 3 + 2 * view]),
+            (abs(columns), abs(rows)),
         )
-        for view, camera in enumerate(cameras)
+        for camera, (columns, rows) in zip(cameras, shifts, strict=True)
     )
 
 
@@ -146,10 +150,12 @@ def path_covariance(
     return found if torch.isfinite(found).all() else None
 
 
-def shift_px(carm: CArm, deviations: Tensor) -> tuple[float, float]:
-    """A shift (2,) of the principal point in units of the C-arm's uncertainty, as columns and rows."""
-    x, y = (deviations * carm.assumed_uncertainty.principal_point_mm).tolist()
-    return x / carm.camera.pixel_mm[1], y / carm.camera.pixel_mm[0]
+def shift_px(carm: CArm, display: Display, shift: Tensor) -> tuple[float, float]:
+    """A shift (2,) of the principal point, in units of the C-arm's uncertainty: columns and rows of stored pictures."""
+    along = shift * carm.assumed_uncertainty.principal_point_mm
+    x, y = (display.camera_from_stored[:2, :2].T @ along).tolist()
+    rows_mm, columns_mm = display.stored_camera(carm.camera).pixel_mm
+    return x / columns_mm, y / rows_mm
 
 
 def _assess_object(

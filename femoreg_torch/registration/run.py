@@ -161,10 +161,11 @@ def register_scene(
     against = doubts(case, told, scene, outcome.poses, covariance, plan.imaging, Limits())
     done = time.perf_counter()
     points, directions = path_in_camera1(case, outcome.poses)
+    displays = [case.display_of(view) for view in range(len(case.views))]
     result = Result(
         poses=outcome.poses,
         quality=quality,
-        cameras=assess_cameras(scene, outcome.poses, covariance) if outcome.poses.changes else (),
+        cameras=assess_cameras(scene, outcome.poses, covariance, displays) if outcome.poses.changes else (),
         doubts=against,
         start=began,
         stages=tuple(outcome.trace),

@@ -8,6 +8,7 @@ import torch
 from registration_scenes import CARM, REFERENCE_POINTS, float64, make_scene, off, true_poses
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import CameraChange, Poses, Uncertainty, rigid
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic
 from femoreg_torch.registration.covariance import pose_covariance
@@ -23,6 +24,7 @@ from femoreg_torch.similarity import GradNcc
 _LEVEL = Level(pixel_mm=3.0, step_mm=1.0)
 _SIMILARITY = GradNcc(patch_radius=5)
 _SCALE = float64(0.02, 0.02, 0.02, 1.0, 1.0, 4.0)
+AS_SEEN = (Display(),) * 3
 _ALL = tuple(REFERENCE_POINTS)
 _MOVES = ([1.0, 1, 1], [1.0, 1, 4])
 
@@ -211,18 +213,42 @@ def test_the_covariance_grows_with_what_is_not_known_of_the_carm(scene: Scene) -
     assert found[0].relative_mm("pelvis", "pelvis") == [0, 0, 0]
 
 
+@pytest.mark.parametrize(
+    ("display", "place"),
+    [
+        (Display(), (50.0, 41.0)),
+        (Display("posterior"), (37.0, 41.0)),  # mirrored: 87 - 50
+        (Display(turned_deg=90), (46.0, 50.0)),  # clockwise: the column 87 - 41, the row 50
+    ],
+)
+def test_refined_cameras_are_told_as_the_pictures_are_stored(
+    scene: Scene, display: Display, place: tuple[float, float]
+) -> None:
+    """As the C-arm's file counts its principal point: of 88 × 88 pixels."""
+    assert CARM.camera.shape == (88, 88)
+    (column, row), (rows_mm, columns_mm) = CARM.camera.principal_point_px, CARM.camera.pixel_mm
+    shift = ((50 - column) * columns_mm, (41 - row) * rows_mm)
+    covariance = final_covariance(scene, true_poses())
+    poses = true_poses().with_changes((CameraChange(principal_point_shift_mm=shift),) * 3)
+    told = assess_cameras(scene, poses, covariance, (display,) * 3)[0]
+    assert told.principal_point_px == pytest.approx(place)
+    upright = assess_cameras(scene, poses, covariance, AS_SEEN)[0].principal_point_deviation_px
+    turned = upright[::-1] if display.turned_deg else upright
+    assert told.principal_point_deviation_px == pytest.approx(turned)
+
+
 def test_a_file_far_from_what_the_images_fit_is_told(scene: Scene) -> None:
     """Ten per cent where two are allowed for, after a refinement that found the right distance."""
     wrong = _wrong(scene, 1.10)
     poses = true_poses().with_changes((CameraChange(1 / 1.10),) * 3)
     covariance = final_covariance(wrong, poses)
-    (told,) = doubts_about_the_carm(wrong, poses, covariance, Limits())
+    (told,) = doubts_about_the_carm(wrong, poses, covariance, Limits(), AS_SEEN)
     assert "the C-arm's file says 1122 mm" in told
     assert "a source distance of 10" in told
-    camera = assess_cameras(wrong, poses, covariance)[0]
+    camera = assess_cameras(wrong, poses, covariance, AS_SEEN)[0]
     assert camera.sdd_mm == pytest.approx(1020)
     assert 0 < camera.sdd_deviation_mm < 0.02 * 1020
-    assert doubts_about_the_carm(scene, true_poses(), final_covariance(scene, true_poses()), Limits()) == ()
+    assert doubts_about_the_carm(scene, true_poses(), final_covariance(scene, true_poses()), Limits(), AS_SEEN) == ()
 
 
 @pytest.mark.parametrize(("shift_mm", "doubted"), [(0.9, False), (2.4, True)])
@@ -231,7 +257,7 @@ def test_a_principal_point_that_refinement_moved_far_is_told(scene: Scene, shift
     poses = true_poses()
     covariance = final_covariance(scene, poses)
     still, shifted = CameraChange(), CameraChange(principal_point_shift_mm=(0.3, -shift_mm))
-    told = doubts_about_the_carm(scene, poses.with_changes((still, shifted, still)), covariance, Limits())
+    told = doubts_about_the_carm(scene, poses.with_changes((still, shifted, still)), covariance, Limits(), AS_SEEN)
     assert len(told) == doubted
     assert all("principal point of view 2 by 2.4 mm" in sentence for sentence in told)
 
@@ -241,7 +267,7 @@ def test_a_source_distance_that_refinement_moved_far_is_told(scene: Scene, facto
     """As with the CT of another patient: 11 % off, and images that say nothing of it at the end."""
     poses = true_poses().with_changes((CameraChange(factor),) * 3)
     covariance = final_covariance(scene, true_poses())
-    told = doubts_about_the_carm(scene, poses, covariance, Limits())
+    told = doubts_about_the_carm(scene, poses, covariance, Limits(), AS_SEEN)
     assert len(told) == doubted
     assert all(f"to {factor * CARM.camera.sdd_mm:.0f} mm" in sentence for sentence in told)
 
