@@ -155,7 +155,7 @@ def pose_covariance(
     by_materials = inverse @ every.hessian[:rigid, len(model.hessian) :]
     clusters = len(model.scores) / (len(model.scores) - 1)
     scores = _by_place(parts, [view for _, view in images])[:, :rigid]
-    of_places = len(scores) / (len(scores) - 1)
+    of_places = len(scores) / max(1, len(scores) - 1)  # one image of one tile has no spread
     by_images = of_places * inverse @ (scores.T @ scores) @ inverse + by_materials @ by_materials.T
     of_intrinsics = profile(model, refined)
     mean, spread = _estimate(of_intrinsics, clusters, refined)
