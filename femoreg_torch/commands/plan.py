@@ -87,6 +87,7 @@ def plan_offsets(
     from femoreg_torch.commands.telling import progress_report, tell_device
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import write_json
+    from femoreg_torch.planning.diffusion import NoMarrowError
     from femoreg_torch.planning.figures import offsets_figure, save
     from femoreg_torch.planning.offsets import directions, turned_ends
     from femoreg_torch.planning.replan import Replan
@@ -103,7 +104,10 @@ def plan_offsets(
         outcomes = {}
         for n, (name, offset) in enumerate(wanted.items()):
             report(name, n / len(wanted))
-            outcomes[name] = again.at(offset)
+            try:
+                outcomes[name] = again.at(offset)
+            except NoMarrowError as error:
+                raise InputError(f"{far:g} mm {name}: {error} Give a smaller --distance-mm.") from error
     write_json(plan / "offsets.json", again.content({name: [o] for name, o in outcomes.items()}) | {"distance_mm": far})
     add_response(plan, again.response(outcomes, far))
     save(offsets_figure(outcomes, again.baseline_n, again.planned_n), plan / "offsets.png")
@@ -126,7 +130,7 @@ def plan_robustness(
     """Carry a plan out under errors of registration, shifts and turns, and tell how its gain is distributed.
 
     Writes robustness.json and robustness.png into PLAN. Errors are drawn from the trusted runs of a study, or from a
-    normal distribution.
+    normal distribution. A draw that leaves an injection without marrow is counted, and has no gain.
 
     Args:
         plan: Folder that `femoreg plan` wrote.
@@ -146,6 +150,7 @@ def plan_robustness(
     from femoreg_torch.commands.telling import progress_report, tell_device
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import write_json
+    from femoreg_torch.planning.diffusion import NoMarrowError
     from femoreg_torch.planning.figures import robustness_figure, save
     from femoreg_torch.planning.offsets import normal_moves, read_covariance, study_moves
     from femoreg_torch.planning.replan import Replan
@@ -167,13 +172,26 @@ def plan_robustness(
         moves = normal_moves(np.zeros(len(variance)) if mean is None else np.array(mean), variance, count, seed)
     again = Replan(plan, case, tell_device(console, device))
     with progress_report(console, "draws") as report:
-        outcomes = []
+        outcomes, lost = [], 0
         for n, move in enumerate(moves):
             report(f"draw {n + 1} of {len(moves)}", n / len(moves))
-            outcomes.append(again.at(move))
+            try:
+                outcomes.append(again.at(move))
+            except NoMarrowError:
+                lost += 1
+    if not outcomes:
+        raise InputError(
+            f"{plan}: in none of {lost} draws does every injection lie in marrow. The errors are too large."
+        )
     gains = [again.gain(outcome.yield_load_n) for outcome in outcomes]
     low, middle, high = np.percentile(gains, [5, 50, 95])
-    spread = {"gain_percent_p5": low, "gain_percent_median": middle, "gain_percent_p95": high, "seed": seed}
+    spread = {
+        "gain_percent_p5": low,
+        "gain_percent_median": middle,
+        "gain_percent_p95": high,
+        "draws_without_marrow": lost,
+        "seed": seed,
+    }
     write_json(plan / "robustness.json", again.content({"draws": outcomes}) | spread)
     save(robustness_figure(outcomes, again.baseline_n, again.planned_n), plan / "robustness.png")
     least = min(outcome.clearance_mm for outcome in outcomes)
@@ -181,3 +199,8 @@ def plan_robustness(
         f"Modelled gain {again.gain(again.planned_n):+.1f} % as planned; under these errors {middle:+.1f} % "
         f"(5 to 95 %: {low:+.1f} to {high:+.1f} %). Least clearance {least:.1f} mm."
     )
+    if lost:
+        console.print(
+            f"[bold red]In {lost} of {len(moves)} draws an injection finds no marrow[/]: they have no gain, and are "
+            "not in these figures."
+        )

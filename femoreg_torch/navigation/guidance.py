@@ -66,6 +66,17 @@ def guide(result: Result) -> Guidance:
     return Guidance(name, tool, object_from_tool, entry_point, tip, path / path.norm(), axis / axis.norm())
 
 
+def untold_turn(result: Result, found: Guidance) -> str | None:
+    """That no image tells the turn of a round tool about its own axis, and what that leaves open, in words; or None."""
+    quality = result.quality.get(found.tool)
+    if quality is None or quality.turn_told:
+        return None
+    return (
+        f"the {found.tool} is round, and no image tells its turn about its own axis: directions in its frame, or in "
+        f"the robot's base, may be turned about it; those in the frame of the {found.object} hold"
+    )
+
+
 def _angle(a: Tensor, b: Tensor) -> float:
     return torch.atan2(torch.linalg.cross(a, b).norm(), a @ b).item()
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from femoreg_torch.case import Result
 from femoreg_torch.geometry import invert_rigid, rotation_angle, transform_points
-from femoreg_torch.navigation.guidance import guide
+from femoreg_torch.navigation.guidance import guide, untold_turn
 from femoreg_torch.navigation.robot import Robot
 
 NAVIGATION_NAME = "navigation.json"
@@ -26,11 +26,8 @@ def navigation_content(result: Result, robot: Robot | None) -> dict[str, Any]:
     found = guide(result)
     name, tool = found.object, found.tool
     reasons = list(result.verdict.reasons)
-    if tool in result.quality and not result.quality[tool].turn_told:
-        reasons.append(
-            f"the {tool} is round, and no image tells its turn about its own axis: directions in its frame, or in the "
-            f"robot's base, may be turned about it; those in the frame of the {name} hold"
-        )
+    if (untold := untold_turn(result, found)) is not None:
+        reasons.append(untold)
     object_from_tool, correction = found.object_from_tool, found.correction
     content: dict[str, Any] = {
         "version": 1,

@@ -10,7 +10,8 @@ from femoreg_torch.errors import InputError, in_mm, shortened
 from femoreg_torch.geometry import check_rigid, read_itk_transform, rigid
 from femoreg_torch.text import MOST_YAML_BYTES, read_bytes
 
-_LEAST_REACH_MM = 10.0  # no tool stands this close to the base of its robot: the numbers are metres
+_LEAST_REACH_MM = 10.0  # no tool or flange stands this close to the base of its robot: the numbers are metres
+_LEAST_TOOL_MM = 2.0  # a tool's origin in its flange is the flange's own, or farther from it: else these are metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +65,22 @@ def read_robot(path: Path, tool: str) -> Robot:
     if base_from_flange is None:
         base_from_tool = poses[f"base_from_{tool}"]
     else:
-        base_from_tool = base_from_flange @ poses[f"flange_from_{tool}"]
+        flange_from_tool = poses[f"flange_from_{tool}"]
+        if 0 < (distance := flange_from_tool[:3, 3].norm().item()) < _LEAST_TOOL_MM:
+            raise _in_metres(path, tool, distance, "its flange")
+        if (distance := base_from_flange[:3, 3].norm().item()) < _LEAST_REACH_MM:
+            raise _in_metres(path, "flange", distance, "the robot's base")
+        base_from_tool = base_from_flange @ flange_from_tool
     if (distance := base_from_tool[:3, 3].norm().item()) < _LEAST_REACH_MM:
-        raise InputError(
-            f"{path}: the {tool} would stand {in_mm(distance)} from the robot's base. Are the translations in metres? "
-            "Write them in mm."
-        )
+        raise _in_metres(path, tool, distance, "the robot's base")
     return Robot(base_from_tool, base_from_flange)
+
+
+def _in_metres(path: Path, what: str, distance: float, place: str) -> InputError:
+    return InputError(
+        f"{path}: the {what} would stand {in_mm(distance)} from {place}. Are the translations in metres? Write them in "
+        "mm."
+    )
 
 
 def _exactly_rigid(pose: Tensor) -> Tensor:

@@ -30,6 +30,10 @@ _LEAST_SHARE = 1e-3  # of an injection that is worth a front of its own
 _REACH_BLOCKS = 2.5  # a source so near to marrow opens into it
 
 
+class NoMarrowError(InputError):
+    """An injection that lies outside the marrow."""
+
+
 @dataclass(frozen=True, eq=False)
 class Injection:
     """An amount of cement at one place."""
@@ -98,7 +102,7 @@ def _nearest(centres: Array, point: Array, size_mm: float) -> int:
     nearest = int(distance.argmin())
     if distance[nearest] > _REACH_BLOCKS * size_mm:
         place = ", ".join(f"{v:.1f}" for v in point)
-        raise InputError(
+        raise NoMarrowError(
             f"injection at ({place}) mm LPS lies {distance[nearest]:.0f} mm from any marrow: the path leaves the bone, "
             "or lies in its cortex. Move it."
         )

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from femoreg_torch.case import RESULT_NAME, Result, read_result
 from femoreg_torch.case.model import Side
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.files import read_csv, read_json
+from femoreg_torch.files import read_csv
 from femoreg_torch.planning.diffusion import diffuse
 from femoreg_torch.planning.path import Ellipsoid, Path, Surroundings
 from femoreg_torch.planning.prepare import Prepared
@@ -84,7 +85,7 @@ def carried_out(
     """The plan moved (6,): by mm, LPS, and turned about its entry point by degrees about the axes of LPS.
 
     path: the path is moved, and cement spreads from it anew. pattern: the cement (X, Y, Z) itself is moved, and what
-    would come to lie outside the marrow is lost. Raises `InputError` where a moved injection finds no marrow.
+    would come to lie outside the marrow is lost. Raises `NoMarrowError` where a moved injection finds no marrow.
     """
     motion = moved_by(path.entry, move)
     entry, target = (motion[:3, :3] @ point + motion[:3, 3] for point in (path.entry, path.target))
@@ -125,21 +126,29 @@ def normal_moves(mean: Array, covariance: Array, draws: int, seed: int) -> Array
 def read_covariance(file: File) -> Array:
     """The covariance in a text file (rows of numbers, with spaces or commas between) or a registration's result.json.
 
-    In a result it is `path_covariance`, of mm and degrees. Raises `InputError` for a file that holds neither.
+    In a result it is `path_covariance`, of mm and degrees. Raises `InputError` for a file that holds neither, and for a
+    result that is not trusted: what it says of its uncertainty does not hold.
     """
     file = File(file)
-    if file.suffix.lower() == ".json":
-        found = read_json(file).get("path_covariance")
-        if found is None:
-            raise InputError(f"{file}: has no path_covariance. Register a case with a planned path and its tool again.")
-        rows: Any = found
-    else:
-        text = read_bytes(file, _MOST_BYTES).decode("utf-8", "replace")
-        rows = [line.replace(",", " ").split() for line in text.splitlines() if line.strip()]
+    if file.name == RESULT_NAME:
+        return _covariance_of(read_result(file.parent), file)
+    text = read_bytes(file, _MOST_BYTES).decode("utf-8", "replace")
+    rows = [line.replace(",", " ").split() for line in text.splitlines() if line.strip()]
     try:
         return np.array(rows, float)
     except (TypeError, ValueError) as error:
         raise InputError(f"{file}: rows of numbers, all of one length, were expected.") from error
+
+
+def _covariance_of(result: Result, file: File) -> Array:
+    if not result.verdict.trusted:
+        raise InputError(
+            f"{file}: is not trusted, so what it says of its uncertainty does not hold: "
+            f"{shortened('; '.join(result.verdict.reasons), 300)}. Register again."
+        )
+    if result.path_covariance is None:
+        raise InputError(f"{file}: has no path_covariance. Register a case with a planned path and its tool again.")
+    return np.asarray(result.path_covariance.numpy(), float)
 
 
 def study_moves(folder: File, draws: int, seed: int) -> Array:

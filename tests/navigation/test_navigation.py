@@ -293,6 +293,10 @@ def changed(row: int, column: int, value: float) -> Matrix:
     return matrix
 
 
+def by_flange(base_from_flange: Matrix, flange_from_device: Matrix) -> str:
+    return f"base_from_flange\n{rows(base_from_flange)}\nflange_from_device\n{rows(flange_from_device)}"
+
+
 def write_scaled_tfm(path: Path) -> None:
     transform = sitk.AffineTransform(3)
     transform.Scale(1.2)
@@ -347,6 +351,8 @@ BAD: list[tuple[str, Callable[[Path], object], str]] = [
         "mirrored",
     ),
     ("a.txt", lambda path: path.write_text(f"base_from_device\n{rows(pose(5, 0.5))}", encoding="utf-8"), "in metres"),
+    ("a.txt", lambda path: path.write_text(by_flange(pose(5, 0.9), pose(6, 85.0)), encoding="utf-8"), "in metres"),
+    ("a.txt", lambda path: path.write_text(by_flange(pose(5, 900.0), pose(6, 0.085)), encoding="utf-8"), "in metres"),
     (
         "a.txt",
         lambda path: path.write_text(f"base_from_device\n{rows(pose(5))}\n" * 2, encoding="utf-8"),

@@ -312,7 +312,15 @@ def test_commands_end_to_end(
     assert main(["plan-robustness", str(out), *shift]) == 0
     found = json.loads((out / "robustness.json").read_text(encoding="utf-8"))
     assert found["gain_percent_median"] == pytest.approx(offsets["outcomes"]["medial"][0]["gain_percent"])
-    capsys.readouterr()
+    assert found["draws_without_marrow"] == 0
+    (folder / "wide.csv").write_text("900,0,0\n0,900,0\n0,0,900\n", encoding="utf-8")
+    wide = ["--covariance", str(folder / "wide.csv"), "--draws", "4", "--seed", "2"]
+    assert main(["plan-robustness", str(out), *wide]) == 0
+    lost = json.loads((out / "robustness.json").read_text(encoding="utf-8"))["draws_without_marrow"]
+    assert 0 < lost < 4
+    assert f"In {lost} of 4 draws an injection finds no marrow" in capsys.readouterr().out
+    assert main(["plan-offsets", str(out), "--distance-mm", "80"]) == 2
+    assert "Give a smaller --distance-mm" in capsys.readouterr().err
     bad = folder / "bad"
     bad.mkdir()
     (bad / "sure.csv").write_bytes(b"\xff\xfe1 2 3")
@@ -327,6 +335,7 @@ def test_commands_end_to_end(
         (["--study", str(bad / "empty")], "no trusted run"),
         (["--study", str(bad / "cut")], "cannot be read as Parquet"),
         (["--covariance", str(bad / "sure.csv")], "rows of numbers"),
+        ([*wide, "--mean", "[200, 0, 0]"], "in none of 4 draws"),
         ([], "either --study or --covariance"),
         (["--covariance", str(folder / "no.csv")], "no such file"),
         (["--covariance", str(folder / "sure.csv"), "--mean", "[1, 2]"], "mean: 3 numbers"),

@@ -9,7 +9,7 @@ import pytest
 import torch
 from pyarrow import parquet, table
 
-from femoreg_torch.case import ObjectQuality, Result
+from femoreg_torch.case import ObjectQuality, Result, result_content
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import write_json
 from femoreg_torch.geometry import Poses
@@ -147,15 +147,27 @@ def test_covariances_are_read_from_text_and_from_results(tmp_path: File) -> None
     wanted = np.diag([1.0, 2.0, 3.0])
     (tmp_path / "a.csv").write_text("1, 0, 0\n0,2,0\n0,0,3\n", encoding="utf-8")
     (tmp_path / "a.txt").write_text("1 0 0\n0 2 0\n\n0 0 3\n", encoding="utf-8")
-    write_json(tmp_path / "result.json", {"path_covariance": np.eye(6)})
-    write_json(tmp_path / "old.json", {"version": 2})
     (tmp_path / "bad.txt").write_text("1 0 0\n0 two 0\n", encoding="utf-8")
     for name in ("a.csv", "a.txt"):
         np.testing.assert_array_equal(read_covariance(tmp_path / name), wanted)
-    np.testing.assert_array_equal(read_covariance(tmp_path / "result.json"), np.eye(6))
-    for name, told in (("old.json", "no path_covariance"), ("bad.txt", "rows of numbers"), ("no.txt", "no such file")):
+    for name, told in (("bad.txt", "rows of numbers"), ("no.txt", "no such file")):
         with pytest.raises(InputError, match=told):
             read_covariance(tmp_path / name)
+    good = ObjectQuality((), 0.0, (0.0, 0.0), (0.1,) * 3, (0.1,) * 3, None, True, "all views agree")
+    pose = torch.eye(4, dtype=torch.float64)
+    result = Result(
+        Poses(pose[None], {"femur": pose}), {"femur": good}, path_covariance=2 * torch.eye(6, dtype=torch.float64)
+    )
+    kept = tmp_path / "result.json"
+    write_json(kept, result_content(result))
+    np.testing.assert_array_equal(read_covariance(kept), 2 * np.eye(6))
+    for other, told in (
+        (dataclasses.replace(result, path_covariance=None), "no path_covariance"),
+        (dataclasses.replace(result, doubts=("the device moved",)), "is not trusted.*the device moved"),
+    ):
+        write_json(kept, result_content(other))
+        with pytest.raises(InputError, match=told):
+            read_covariance(kept)
 
 
 @pytest.mark.parametrize("suffix", ["parquet", "csv"])

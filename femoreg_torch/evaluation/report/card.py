@@ -13,7 +13,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation.report.uncertainty import GuideUncertainty, guide_uncertainty
 from femoreg_torch.evaluation.report.words import sentence
 from femoreg_torch.geometry import rotation_angle
-from femoreg_torch.navigation import Guidance, guide
+from femoreg_torch.navigation import Guidance, guide, untold_turn
 
 _TRUSTED = (
     "Every check passed: each image is explained by what was drawn into it, the views agree with one another, and the "
@@ -47,8 +47,8 @@ class Card:
     left_out: tuple[str, ...]
 
 
-def card(case: Case, result: Result, reference_points: dict[str, Tensor]) -> Card:
-    """The card of a result; `reference_points` (3,) are those of its objects, mm in their own space."""
+def card(case: Case, result: Result) -> Card:
+    """The card of a result."""
     verdict = result.verdict
     headline = "Trusted" if verdict.trusted else "Not trusted"
     reasons = tuple(sentence(reason) for reason in verdict.reasons) or (_TRUSTED,)
@@ -58,14 +58,14 @@ def card(case: Case, result: Result, reference_points: dict[str, Tensor]) -> Car
     except InputError as error:
         steps = tuple(_next(result, None, None))
         return Card(verdict.trusted, headline, reasons, (), sentence(str(error)), (), steps, left_out)
-    sure = guide_uncertainty(result, reference_points)
+    sure = guide_uncertainty(result)
     return Card(
         verdict.trusted,
         headline,
         reasons,
         tuple(_numbers(found, sure)),
         "",
-        tuple(_correction(case, found)),
+        tuple(_correction(case, found, untold_turn(result, found))),
         tuple(_next(result, found, sure)),
         left_out,
     )
@@ -97,20 +97,24 @@ def _numbers(found: Guidance, sure: GuideUncertainty | None) -> Iterator[Number]
     )
 
 
-def _correction(case: Case, found: Guidance) -> Iterator[str]:
-    """The smallest motion that brings the guide onto the path, in words: first a turn, then a shift."""
+def _correction(case: Case, found: Guidance, untold: str | None) -> Iterator[str]:
+    """The smallest motion that brings the guide onto the path, in words: first a turn, then a shift.
+
+    `untold` says why directions along the tool's own axes are not known; None where they are.
+    """
     turn = math.degrees(rotation_angle(found.correction[:3, :3]).item())
     shift = -found.tip_offset  # in the tool's frame
     length = float(shift.norm())
     if turn >= _NO_TURN_DEG:
         yield f"Turn the {found.tool} by {turn:.2f}° about its tip, until its guide is parallel to the planned path."
-    if case.objects[found.object].model is None:
-        moved = found.object_from_tool[:3, :3] @ shift
-        yield f"Move the tip by {length:.2f} mm: {_anatomical(moved)}."
-        yield f"That is {_vector(shift)} mm along the {found.tool}'s own axes, before it is turned."
-    else:
-        own = f"{_vector(shift)} mm along the {found.tool}'s own axes"
-        yield f"Move the tip by {length:.2f} mm: {own}, before it is turned."
+    moved = found.object_from_tool[:3, :3] @ shift
+    in_ct = case.objects[found.object].model is None
+    place = _anatomical(moved) if in_ct else f"{_vector(moved)} mm along the axes of the {found.object}"
+    yield f"Move the tip by {length:.2f} mm: {place}."
+    if untold is not None:
+        yield f"Not known along the {found.tool}'s own axes: {untold}. So navigation.json is not trusted."
+        return
+    yield f"That is {_vector(shift)} mm along the {found.tool}'s own axes, before it is turned."
     yield "All of it as matrices: navigation.json, beside this report."
 
 

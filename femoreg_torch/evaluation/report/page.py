@@ -37,7 +37,7 @@ def report_page(case: Case, scene: Scene, result: Result, errors: dict[str, Any]
         views=len(case.views),
         simulated=case.truth is not None and case.anchor in case.truth.camera1_from,
         notice=NOTICE,
-        card=card(case, result, {name: thing.reference_point for name, thing in scene.objects.items()}),
+        card=card(case, result),
         sections=[section for section in made if section is not None],
         style=source_of(templates, "report.css"),
         scripts=scripts,
