@@ -6,12 +6,10 @@ import numpy as np
 import pandas as pd
 
 from femoreg_torch.statistics.formats import Table, between, number, percent
-from femoreg_torch.statistics.intervals import Interval, difference_interval, mean_interval
+from femoreg_torch.statistics.intervals import UNKNOWN, Interval, difference_interval, mean_interval
 from femoreg_torch.statistics.outcome import WRONG_MM, asked, told
 from femoreg_torch.statistics.quantities import QUANTITIES, RELATIVE
-from femoreg_torch.statistics.rows import ALL, ROUND, folder_name, groups
-
-PROCEDURE = ("condition", "number", "patient", "side", "seed")  # what makes two runs runs of one procedure
+from femoreg_torch.statistics.rows import ALL, PROCEDURE, ROUND, folder_name, groups, procedures
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ def matched(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame | None:
     another name may be one of the same procedures. A procedure that a study holds twice cannot be matched.
     """
     same = set(first["condition"]) == set(second["condition"])
-    keys = list(PROCEDURE if same else PROCEDURE[1:]) + [ROUND] * (ROUND in first and ROUND in second)
+    keys = ["condition"] * same + list(PROCEDURE) + [ROUND] * (ROUND in first and ROUND in second)
     if any(rows.duplicated(keys).any() for rows in (first, second)):
         return None
     found = [rows[keys].assign(**{name: range(len(rows))}) for name, rows in (("first", first), ("second", second))]
@@ -50,17 +48,28 @@ def matched(first: pd.DataFrame, second: pd.DataFrame) -> pd.DataFrame | None:
     return pairs[["first", "second"]] if len(pairs) == min(len(first), len(second)) else None
 
 
-def difference(first: pd.Series, second: pd.Series, pairs: pd.DataFrame | None, seed: int) -> Difference:
-    """Of the means of two series of values, nan where a run has none, by `pairs` of `matched` if there are any."""
+def difference(
+    first: "pd.Series[float]",
+    second: "pd.Series[float]",
+    pairs: pd.DataFrame | None,
+    clusters: tuple[np.ndarray, np.ndarray],
+    seed: int,
+) -> Difference:
+    """Of the means of two series of values, nan where a run has none, by `pairs` of `matched` if there are any.
+
+    `clusters` are numbers that the runs of one procedure share. Of unpaired runs some of which share one there is no
+    interval.
+    """
     a, b = first.to_numpy(float), second.to_numpy(float)
     if pairs is None:
+        apart = all(len(np.unique(numbers)) == len(numbers) for numbers in clusters)
         a, b = a[~np.isnan(a)], b[~np.isnan(b)]
-        interval = difference_interval(a, b, seed)
+        interval = difference_interval(a, b, seed) if apart else UNKNOWN
     else:
         a, b = a[pairs["first"]], b[pairs["second"]]
         both = ~np.isnan(a) & ~np.isnan(b)
         a, b = a[both], b[both]
-        interval = mean_interval(a - b, seed)
+        interval = mean_interval(a - b, seed, clusters[0][pairs["first"]][both])
     means = [float(part.mean()) if len(part) else float("nan") for part in (a, b)]
     return Difference(means[0], means[1], interval, (len(a), len(b)), pairs is not None)
 
@@ -78,15 +87,16 @@ def beside_tables(first: pd.DataFrame, second: pd.DataFrame, names: tuple[str, s
 def beside_table(first: pd.DataFrame, second: pd.DataFrame, names: tuple[str, str], group: str, seed: int) -> Table:
     """Mean errors of two groups of runs, both called `group`, and the share of runs that are good enough."""
     pairs = matched(first, second)
+    clusters = procedures(first).to_numpy(), procedures(second).to_numpy()
     lines, data = [], []
     for quantity in QUANTITIES:
-        found = difference(told(first, quantity.column), told(second, quantity.column), pairs, seed)
+        found = difference(told(first, quantity.column), told(second, quantity.column), pairs, clusters, seed)
         if min(found.counts):
             means = [number(value, quantity.digits) for value in (found.first, found.second)]
             told_difference = number(found.value, quantity.digits, "+"), between(found.interval, quantity.digits)
             lines.append((quantity.label, _counts(found), *means, *told_difference, _clear(found)))
             data.append(_numbers(quantity.column, found))
-    found = difference(_good(first), _good(second), pairs, seed)
+    found = difference(_good(first), _good(second), pairs, clusters, seed)
     if min(found.counts):
         shares = [percent(value) for value in (found.first, found.second)]
         low, high = found.interval
@@ -96,8 +106,8 @@ def beside_table(first: pd.DataFrame, second: pd.DataFrame, names: tuple[str, st
         data.append(_numbers("success", found))
     how = "Paired: differences of the same procedures." if pairs is not None else "Not paired: different procedures."
     note = (
-        f"{how} 95 %: bootstrap of the difference; clear if it does not hold 0. Runs that gave no error are in no "
-        "mean; in the share of good runs they count as not good."
+        f"{how} 95 %: bootstrap of the difference, runs of one procedure drawn together; clear if it does not hold 0. "
+        "Runs that gave no error are in no mean; in the share of good runs they count as not good."
     )
     columns = ("mean error", "runs", *names, "difference", "95 %", "clear")
     title = f"{names[0]} beside {names[1]}: {group}"

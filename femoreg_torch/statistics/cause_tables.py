@@ -26,29 +26,31 @@ def dependence_table(rows: pd.DataFrame) -> Table:
             continue
         lines.append((plain_name(key), *map(_correlation, found)))
         data += [{"varied": key, "error": q.column, **_correlated(c)} for q, c in zip(quantities, found, strict=True)]
-    note = "Spearman's ρ with its 95 % interval, over the runs that gave an error. An interval around 0 tells nothing."
+    note = (
+        "Spearman's ρ with its 95 % interval, over the runs that gave an error, taken as independent. An interval "
+        "around 0 tells nothing."
+    )
     columns = ("varied", *(q.name for q in quantities))
     return Table("dependence", "What errors depend on", note, columns, tuple(lines), pd.DataFrame(data))
 
 
-def origin_table(rows: pd.DataFrame, seed: int) -> Table:
+def origin_table(rows: pd.DataFrame) -> Table:
     """What C-arm views, femur and device explain of the relative error."""
     lines, data = [], []
-    for found in relative_origins(rows, seed):
-        ranges = [between((100 * o.interval[0], 100 * o.interval[1]), 0) for o in found.origins]
-        shares = [f"{percent(o.share)} ({range_})" for o, range_ in zip(found.origins, ranges, strict=True)]
+    for found in relative_origins(rows):
+        shares = [percent(o.share) for o in found.origins]
         partials = [percent(o.partial) for o in found.origins]
         lines.append((found.response, str(found.count), percent(found.r2), percent(found.adjusted), *shares, *partials))
         data += [
             {"response": found.response, "runs": found.count, "r2": found.r2, "adjusted_r2": found.adjusted}
-            | {"group": o.group, "share": o.share, "low": o.interval[0], "high": o.interval[1], "partial": o.partial}
+            | {"group": o.group, "share": o.share, "partial": o.partial}
             for o in found.origins
         ]
     columns = ("", "runs", "R²", "adjusted", *SOURCES, *(f"{group}, partial R²" for group in SOURCES))
     note = (
-        "Linear regression on the errors of each. R² is divided by the mean over all orders of entry, with 95 % "
-        "bootstrap intervals; partial R² is what a group explains of that which the others leave. Length: by "
-        "lengths and angles; along an axis: by signed parts."
+        "Linear regression on the errors of each. R² is divided by the mean over all orders of entry; what noise alone "
+        "explains of few runs is in it, and taken off in `adjusted`. Partial R² is what a group explains of that which "
+        "the others leave. Length: by lengths and angles; along an axis: by signed parts."
     )
     title = f"Where the error from {RELATIVE.name} comes from"
     return Table("origins", title, note, columns, tuple(lines), pd.DataFrame(data))

@@ -6,7 +6,7 @@ import pandas as pd
 
 from femoreg_torch.statistics.formats import PAPER, between, percent
 from femoreg_torch.statistics.quantities import Quantity
-from femoreg_torch.statistics.rows import DONE, FAILED, REFUSED, source
+from femoreg_torch.statistics.rows import DONE, FAILED, REFUSED, procedures, source
 from femoreg_torch.statistics.summary import Rate, Statistics
 
 
@@ -38,5 +38,9 @@ def about_runs(rows: pd.DataFrame) -> str:
     counts = {status: int(rows["status"].eq(status).sum()) for status in (DONE, REFUSED, FAILED)}
     flagged = counts[DONE] - int(rows["trusted"].sum())
     told_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
-    runs = f"{len(rows)} {source(rows)} runs: {told_counts}; of the done ones {flagged} are flagged, and counted here."
+    apart = procedures(rows).nunique()
+    of = "" if apart == len(rows) else f" of {apart} procedures"
+    runs = (
+        f"{len(rows)} {source(rows)} runs{of}: {told_counts}; of the done ones {flagged} are flagged, and counted here."
+    )
     return f"{runs} {about_failures()}"

@@ -4,7 +4,7 @@ import pandas as pd
 
 from femoreg_torch.statistics.formats import Table, number, plus_minus
 from femoreg_torch.statistics.intervals import mean_interval
-from femoreg_torch.statistics.rows import EVALUATIONS, ROUND, ROUNDS, SECONDS
+from femoreg_torch.statistics.rows import EVALUATIONS, ROUND, ROUNDS, SECONDS, procedures
 
 
 def round_table(rows: pd.DataFrame, seed: int) -> Table:
@@ -16,7 +16,7 @@ def round_table(rows: pd.DataFrame, seed: int) -> Table:
         cells = []
         for column, values in found.items():
             digits = 2 if column.endswith("_mm") else 3
-            interval = mean_interval(values, seed)
+            interval = mean_interval(values, seed, procedures(part)[values.index])
             mean, deviation = float(values.mean()), float(values.std(ddof=1))
             cells += [plus_minus(mean, deviation, digits), number(float(values.median()), digits)]
             data.append({"round": number_, "column": column, "runs": len(values), "mean": mean, "deviation": deviation})

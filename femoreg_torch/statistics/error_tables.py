@@ -6,7 +6,7 @@ from femoreg_torch.statistics.cells import about_runs, error_numbers
 from femoreg_torch.statistics.formats import PAPER, Table, between, number, plus_minus
 from femoreg_torch.statistics.outcome import told
 from femoreg_torch.statistics.quantities import AXES, METRICS, POSE_QUANTITIES, POSES, QUANTITIES
-from femoreg_torch.statistics.summary import interval_of_mean, statistics
+from femoreg_torch.statistics.summary import Statistics, interval_of_mean, statistics
 
 
 def pose_table(rows: pd.DataFrame) -> Table:
@@ -17,14 +17,22 @@ def pose_table(rows: pd.DataFrame) -> Table:
         if not found[0][1].asked:
             continue
         lines += [
-            (name, "mean ± SD", *(plus_minus(s.mean, s.deviation, q.digits) for q, s in found)),
-            ("", "median", *(number(s.median, q.digits) for q, s in found)),
-            ("", f"{PAPER}, mean ± SD", *(plus_minus(q.paper.mean, q.paper.deviation, 2) for q, _ in found)),
-            ("", f"{PAPER}, median", *(number(q.paper.median, 2) for q, _ in found)),
+            (name, _count(found[0][1]), "mean ± SD", *(plus_minus(s.mean, s.deviation, q.digits) for q, s in found)),
+            ("", "", "median", *(number(s.median, q.digits) for q, s in found)),
+            ("", "", f"{PAPER}, mean ± SD", *(plus_minus(q.paper.mean, q.paper.deviation, 2) for q, _ in found)),
+            ("", "", f"{PAPER}, median", *(number(q.paper.median, 2) for q, _ in found)),
         ]
         data += [error_numbers(q, s) for q, s in found]
     axes = [axis.upper() for axis in AXES]
-    columns = ("", "", *(f"{axis} mm" for axis in axes), "total mm", *(f"{axis} °" for axis in axes), "total °")
+    columns = (
+        "",
+        "runs in mean",
+        "",
+        *(f"{axis} mm" for axis in axes),
+        "total mm",
+        *(f"{axis} °" for axis in axes),
+        "total °",
+    )
     return Table("poses", "Pose errors", about_runs(rows), columns, tuple(lines), pd.DataFrame(data))
 
 
@@ -34,6 +42,7 @@ def metric_table(rows: pd.DataFrame) -> Table:
     lines = [
         (
             q.label,
+            _count(s),
             plus_minus(s.mean, s.deviation, q.digits),
             number(s.median, q.digits),
             plus_minus(q.paper.mean, q.paper.deviation, 2),
@@ -41,7 +50,7 @@ def metric_table(rows: pd.DataFrame) -> Table:
         )
         for q, s in found
     ]
-    columns = ("", "mean ± SD", "median", "paper, mean ± SD", "paper, median")
+    columns = ("", "runs in mean", "mean ± SD", "median", "paper, mean ± SD", "paper, median")
     data = pd.DataFrame([error_numbers(q, s) for q, s in found])
     return Table("metrics", "Errors that steer the drill", about_runs(rows), columns, tuple(lines), data)
 
@@ -59,7 +68,7 @@ def error_table(rows: pd.DataFrame, seed: int) -> Table:
         lines.append(
             (
                 q.label,
-                f"{s.count} of {s.asked}",
+                _count(s),
                 plus_minus(s.mean, s.deviation, q.digits),
                 between(interval, q.digits),
                 *(number(value, q.digits) for value in (s.median, of_trusted, s.percentile_95, s.maximum)),
@@ -75,3 +84,7 @@ def error_table(rows: pd.DataFrame, seed: int) -> Table:
     )  # fmt: skip
     note = about_runs(rows) + " 95 % of mean: bootstrap, bias-corrected and accelerated."
     return Table("errors", "Errors with intervals", note, columns, tuple(lines), pd.DataFrame(data))
+
+
+def _count(found: Statistics) -> str:
+    return f"{found.count} of {found.asked}"

@@ -14,15 +14,20 @@ Interval = tuple[float, float]
 UNKNOWN: Interval = (float("nan"), float("nan"))
 
 
-def mean_interval(values: ArrayLike, seed: int) -> Interval:
-    """Of the mean of independent values: bootstrap, bias-corrected and accelerated (Efron, JASA 82 (1987) 171).
+def mean_interval(values: ArrayLike, seed: int, clusters: ArrayLike | None = None) -> Interval:
+    """Of the mean of values: bootstrap, bias-corrected and accelerated (Efron, JASA 82 (1987) 171).
 
-    nan for fewer than two values, and for values that are all the same.
+    Values of one cluster, whole numbers (N,), are drawn together; without clusters each stands for itself. nan for
+    fewer than two clusters, and for values that are all the same.
     """
     sample = np.asarray(values, float)
     if len(sample) < 2 or np.ptp(sample) == 0:
         return UNKNOWN  # a sample without spread says nothing about the spread
-    return _bootstrap((sample,), _mean, seed)
+    cluster = np.arange(len(sample)) if clusters is None else np.unique(clusters, return_inverse=True)[1]
+    counts = np.bincount(cluster)
+    if len(counts) < 2:
+        return UNKNOWN
+    return _bootstrap((np.bincount(cluster, sample), counts), _mean, seed, paired=True)
 
 
 def difference_interval(first: ArrayLike, second: ArrayLike, seed: int) -> Interval:
@@ -33,15 +38,15 @@ def difference_interval(first: ArrayLike, second: ArrayLike, seed: int) -> Inter
     return _bootstrap(samples, _difference, seed)
 
 
-def _mean(values: np.ndarray, axis: int) -> np.ndarray:
-    return values.mean(axis)
+def _mean(sums: np.ndarray, counts: np.ndarray, axis: int) -> np.ndarray:
+    return sums.sum(axis) / counts.sum(axis)
 
 
 def _difference(first: np.ndarray, second: np.ndarray, axis: int) -> np.ndarray:
     return first.mean(axis) - second.mean(axis)
 
 
-def _bootstrap(samples: tuple[np.ndarray, ...], statistic: object, seed: int) -> Interval:
+def _bootstrap(samples: tuple[np.ndarray, ...], statistic: object, seed: int, paired: bool = False) -> Interval:
     batch = max(1, _BATCH_VALUES // max(map(len, samples)))
     found = bootstrap(
         samples,
@@ -49,6 +54,7 @@ def _bootstrap(samples: tuple[np.ndarray, ...], statistic: object, seed: int) ->
         n_resamples=RESAMPLES,
         batch=batch,
         vectorized=True,
+        paired=paired,
         confidence_level=_LEVEL,
         method="BCa",
         rng=np.random.default_rng(seed),

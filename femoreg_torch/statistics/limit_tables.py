@@ -47,6 +47,9 @@ def read_bounds(folder: Path) -> pd.DataFrame | None:
         raise InputError(f"{path}: cannot be read as Parquet ({' '.join(str(error).split())}).") from error
     if missing := [column for column in _NEEDED if column not in found]:
         raise InputError(f"{path}: has no column {', '.join(missing)}. Remove it, or write it by `sim.study limits`.")
+    for column in [c for c in found if c == "number" or c in BY_COLUMN]:
+        if not pd.api.types.is_numeric_dtype(found[column]):
+            raise InputError(f"{path}, column {column}: numbers were expected. Write it anew by `sim.study limits`.")
     return found
 
 
@@ -61,8 +64,7 @@ def limit_tables(rows: pd.DataFrame, bounds: pd.DataFrame) -> list[Table]:
 def limit_table(rows: pd.DataFrame, bounds: pd.DataFrame) -> Table:
     """Root mean squares of each error and of its bounds over the same procedures."""
     limits = bounds[bounds["what"].eq(BOUND) & bounds["images"].eq(ALL_IMAGES)]
-    numbers = sorted(set(limits["number"]))
-    same = rows[rows["number"].isin(numbers)]
+    same = rows[rows["number"].isin(limits["number"])]
     noisy = bounds[bounds["what"].eq(REGISTERED)]
     kinds = list(dict.fromkeys(limits["unknown"]))
     lines, data = [], []
@@ -71,20 +73,21 @@ def limit_table(rows: pd.DataFrame, bounds: pd.DataFrame) -> Table:
         if q.column not in limits or errors.empty:
             continue
         error = _rms(errors)
-        found = {kind: _rms(limits.loc[limits["unknown"].eq(kind), q.column]) for kind in kinds}
+        own = limits[limits["number"].isin(same.loc[errors.index, "number"])]  # of the runs that gave this error
+        found = {kind: _rms(own.loc[own["unknown"].eq(kind), q.column]) for kind in kinds}
         alone = _rms(noisy[q.column]) if q.column in noisy and len(noisy) else float("nan")
-        ratio = error / found[USUAL] if USUAL in found else float("nan")
+        ratio = error / found[USUAL] if found.get(USUAL, 0) > 0 else float("nan")
         cells = [_fine(value, q) for value in (error, alone, *found.values())]
-        lines.append((q.label, *cells, number(ratio, 1)))
+        lines.append((q.label, str(len(errors)), *cells, number(ratio, 1)))
         data.append({"error": q.column, "unit": q.unit, "runs": len(errors), "rms": error, "noise_alone": alone}
                     | {f"bound {kind}": value for kind, value in found.items()} | {"ratio": ratio})  # fmt: skip
     note = (
-        f"Root mean squares over {len(same)} procedures. Bounds: the least that the noise of photons and electronics "
-        f"allows, with more and more unknown beside the poses. Ratio: error by the bound `{USUAL}`. Noise "
-        "alone: the last stage on images that show what it draws, with photon noise, of "
+        "Root mean squares over the runs that gave the error, and over their bounds. Bounds: the least that the noise "
+        "of photons and electronics allows, with more and more unknown beside the poses. Ratio: error by the bound "
+        f"`{USUAL}`. Noise alone: the last stage on images that show what it draws, with photon noise, of "
         f"{noisy['number'].nunique()} procedures; – where none was registered."
     )
-    columns = ("", "error", "noise alone", *(f"bound, {kind}" for kind in kinds), "ratio")
+    columns = ("", "runs", "error", "noise alone", *(f"bound, {kind}" for kind in kinds), "ratio")
     return Table("limits", "How far from the limit", note, columns, tuple(lines), pd.DataFrame(data))
 
 

@@ -2,7 +2,8 @@
 
 R² is divided by the mean over all orders in which the groups can enter (Lindeman, Merenda & Gold 1980; Grömping, Am
 Stat 61 (2007) 139), so that the shares of correlated groups sum to R². The partial R² of a group is what it explains of
-that which the other groups leave.
+that which the other groups leave. Shares have no intervals: R² of resampled runs lies above the true one, so that the
+bootstrap's do not hold.
 """
 
 from collections.abc import Mapping
@@ -13,13 +14,11 @@ from math import comb
 import numpy as np
 import pandas as pd
 
-from femoreg_torch.statistics.intervals import Interval
 from femoreg_torch.statistics.outcome import told
 from femoreg_torch.statistics.quantities import AXES
 from femoreg_torch.statistics.rows import DONE
 
 SOURCES = {"C-arm views": ("view2", "view3"), "femur": ("femur",), "device": ("device",)}
-_RESAMPLES = 400
 _SAME = 1e-10  # below this share of the largest eigenvalue columns tell the same
 _RUNS_PER_COLUMN = 3  # fewer let a regression explain noise
 
@@ -30,7 +29,6 @@ class Origin:
 
     group: str
     share: float  # of the response's variance; those of all groups sum to R²
-    interval: Interval  # 95 %, of the share
     partial: float  # partial R²
 
 
@@ -45,26 +43,18 @@ class Explanation:
     origins: tuple[Origin, ...]
 
 
-def explained(response: np.ndarray, groups: Mapping[str, np.ndarray], name: str, seed: int | None) -> Explanation:
-    """Regress `response` (N,) on the columns (N, k) of all groups; without a seed there are no intervals."""
+def explained(response: np.ndarray, groups: Mapping[str, np.ndarray], name: str) -> Explanation:
+    """Regress `response` (N,) on the columns (N, k) of all groups."""
     sizes = [part.shape[1] for part in groups.values()]
     values = np.column_stack([*groups.values(), response])
     shares, partials, r2 = _division(values, sizes)
-    low = high = np.full(len(groups), np.nan)
-    if seed is not None:
-        rng = np.random.default_rng(seed)
-        draws = [_division(values[rng.integers(len(values), size=len(values))], sizes)[0] for _ in range(_RESAMPLES)]
-        low, high = np.nanquantile(draws, (0.025, 0.975), axis=0)
     adjusted = 1 - (1 - r2) * (len(values) - 1) / (len(values) - sum(sizes) - 1)
     return Explanation(
         name,
         len(response),
         r2,
         adjusted,
-        tuple(
-            Origin(group, float(shares[k]), (float(low[k]), float(high[k])), float(partials[k]))
-            for k, group in enumerate(groups)
-        ),
+        tuple(Origin(group, float(shares[k]), float(partials[k])) for k, group in enumerate(groups)),
     )
 
 
@@ -102,7 +92,7 @@ def _r2(correlations: np.ndarray, columns: list[int]) -> float:
     return float(with_response @ np.linalg.lstsq(inner, with_response, rcond=_SAME)[0])
 
 
-def relative_origins(rows: pd.DataFrame, seed: int | None) -> list[Explanation]:
+def relative_origins(rows: pd.DataFrame) -> list[Explanation]:
     """Of the length of the relative error by lengths and angles, and of each of its parts by signed ones.
 
     The parts need the optional columns `entry_point_mm_is`, `tip_mm_is`, …. What too few runs could tell is left out.
@@ -110,17 +100,17 @@ def relative_origins(rows: pd.DataFrame, seed: int | None) -> list[Explanation]:
     done = rows[rows["status"].eq(DONE)]
     totals = {group: [f"{key}_{unit}" for key in keys for unit in ("mm", "deg")] for group, keys in SOURCES.items()}
     signed = {group: [f"{column}_{axis}" for column in columns for axis in AXES] for group, columns in totals.items()}
-    found = [_explanation(done, told(done, "relative_mm"), totals, "length", seed)]
+    found = [_explanation(done, told(done, "relative_mm"), totals, "length")]
     for axis in AXES:
         points = [f"{point}_mm_{axis}" for point in ("entry_point", "tip")]
         if all(point in done for point in points):
             response = done[points[0]] - done[points[1]]
-            found.append(_explanation(done, response, signed, f"along {axis.upper()}", seed))
+            found.append(_explanation(done, response, signed, f"along {axis.upper()}"))
     return [explanation for explanation in found if explanation is not None]
 
 
 def _explanation(
-    rows: pd.DataFrame, response: pd.Series, columns: Mapping[str, list[str]], name: str, seed: int | None
+    rows: pd.DataFrame, response: pd.Series, columns: Mapping[str, list[str]], name: str
 ) -> Explanation | None:
     every = [column for group in columns.values() for column in group]
     if any(column not in rows for column in every):
@@ -129,4 +119,4 @@ def _explanation(
     values = response[whole].to_numpy(float)
     if len(values) < _RUNS_PER_COLUMN * len(every) or np.ptp(values) == 0:
         return None
-    return explained(values, {g: rows.loc[whole, c].to_numpy(float) for g, c in columns.items()}, name, seed)
+    return explained(values, {g: rows.loc[whole, c].to_numpy(float) for g, c in columns.items()}, name)

@@ -20,6 +20,7 @@ from femoreg_torch.statistics.quantities import AXES, METRICS, OBJECTS, PELVIS_A
 
 ROWS_NAME, TRIALS_NAME = "runs.parquet", "trials.parquet"
 IDENTITY = ("study", "condition", "number", "patient", "kind", "side", "seed", "preset", "code", "settings")
+PROCEDURE = ("number", "patient", "side", "seed")  # what makes two runs runs of one procedure
 OUTCOME = ("status", "reason", "trusted", "reasons")
 DONE, REFUSED, FAILED = "done", "refused", "failed"
 VARIED, SECONDS, EVALUATIONS, VERSION = "varied_", "seconds_", "evaluations_", "version_"  # how names of columns start
@@ -120,6 +121,14 @@ def groups(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
             f"conditions {', '.join(found)}: two would share a folder, or use that of {shortened(ALL)}. Rename them."
         )
     return {ALL: rows, **found} if len(found) > 1 else found
+
+
+def procedures(rows: pd.DataFrame) -> "pd.Series[int]":
+    """A number for each run that runs of one procedure share: under several conditions, or in rounds of a closed loop.
+
+    Such runs are not independent: they have patient, poses and noise in common.
+    """
+    return rows.groupby(list(PROCEDURE), sort=False, dropna=False).ngroup()
 
 
 def folder_name(condition: str) -> str:

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from femoreg_torch.statistics.intervals import Interval, mean_interval, rate_interval
+from femoreg_torch.statistics.intervals import UNKNOWN, Interval, mean_interval, rate_interval
 from femoreg_torch.statistics.outcome import asked, everything, is_flagged, object_is_wrong, run_is_wrong, told
 from femoreg_torch.statistics.quantities import AXES, OBJECTS
+from femoreg_torch.statistics.rows import procedures
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,9 @@ def _quantile(values: np.ndarray, share: float) -> float:
 
 
 def interval_of_mean(rows: pd.DataFrame, column: str, seed: int) -> Interval:
-    """95 % interval of the mean of the runs that gave an error."""
-    return mean_interval(told(rows, column)[asked(rows, column)].dropna(), seed)
+    """95 % interval of the mean of the runs that gave an error; runs of one procedure are drawn together."""
+    values = told(rows, column)[asked(rows, column)].dropna()
+    return mean_interval(values, seed, procedures(rows)[values.index])
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ class Rate:
 
     met: int
     of: int
+    independent: bool = True  # False where several runs are of one procedure
 
     @property
     def share(self) -> float:
@@ -65,24 +68,29 @@ class Rate:
 
     @property
     def interval(self) -> Interval:
-        """Wilson's."""
-        return rate_interval(self.met, self.of)
+        """Wilson's; unknown for runs that are not independent."""
+        return rate_interval(self.met, self.of) if self.independent else UNKNOWN
+
+
+def independent(rows: pd.DataFrame) -> bool:
+    """Whether no two runs are of one procedure."""
+    return not procedures(rows).duplicated().any()
 
 
 def within(rows: pd.DataFrame, column: str, limit: float) -> Rate:
     """Of the runs that should have an error: those that have one of at most `limit`."""
     values = everything(rows, column)
-    return Rate(int((values <= limit).sum()), len(values))
+    return Rate(int((values <= limit).sum()), len(values), independent(rows))
 
 
 def right_runs(rows: pd.DataFrame) -> Rate:
     """Runs that place every object, and entry point to tip, within the limits of `outcome`."""
-    return Rate(int((~run_is_wrong(rows)).sum()), len(rows))
+    return Rate(int((~run_is_wrong(rows)).sum()), len(rows), independent(rows))
 
 
 def trusted_runs(rows: pd.DataFrame) -> Rate:
     """Runs that say that they can be trusted."""
-    return Rate(int((~is_flagged(rows)).sum()), len(rows))
+    return Rate(int((~is_flagged(rows)).sum()), len(rows), independent(rows))
 
 
 @dataclass(frozen=True)
@@ -93,11 +101,12 @@ class Confusion:
     right_flagged: int
     wrong_trusted: int
     wrong_flagged: int
+    independent: bool
 
     @property
     def harm(self) -> Rate:
         """Wrong ones among the trusted."""
-        return Rate(self.wrong_trusted, self.wrong_trusted + self.right_trusted)
+        return Rate(self.wrong_trusted, self.wrong_trusted + self.right_trusted, self.independent)
 
 
 def confusion(rows: pd.DataFrame, name: str | None = None) -> Confusion | None:
@@ -114,6 +123,7 @@ def confusion(rows: pd.DataFrame, name: str | None = None) -> Confusion | None:
         int((counted & ~wrong & flagged).sum()),
         int((counted & wrong & ~flagged).sum()),
         int((counted & wrong & flagged).sum()),
+        independent(rows),
     )
 
 
@@ -129,13 +139,13 @@ class Coverage:
 
 def coverage(rows: pd.DataFrame) -> list[Coverage]:
     """Of every object whose deviation the runs state, over the runs that give both error and deviation."""
-    found = []
+    found, apart = [], independent(rows)
     for name in OBJECTS:
         for unit in ("mm", "deg"):
             ratios = [deviations_off(rows, name, unit, axis) for axis in AXES]
             if any(len(ratio) for ratio in ratios):
                 one, two = (
-                    tuple(Rate(int((ratio <= times).sum()), len(ratio)) for ratio in ratios) for times in (1, 2)
+                    tuple(Rate(int((ratio <= times).sum()), len(ratio), apart) for ratio in ratios) for times in (1, 2)
                 )
                 found.append(Coverage(name, unit, one, two))
     return found

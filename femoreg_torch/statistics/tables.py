@@ -25,7 +25,7 @@ def group_tables(rows: pd.DataFrame, seed: int) -> list[Table]:
         coverage_table(rows),
         round_table(rows, seed),
         dependence_table(rows),
-        origin_table(rows, seed),
+        origin_table(rows),
         cost_table(rows),
     ]
     return [table for table in tables if table.rows]

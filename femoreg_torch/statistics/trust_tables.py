@@ -26,7 +26,7 @@ def success_table(rows: pd.DataFrame) -> Table:
     rates = [(name, rate) for name, rate in rates if rate.of]
     lines = tuple((name, f"{rate.met} of {rate.of}", *rate_cells(rate)) for name, rate in rates)
     data = pd.DataFrame([{"criterion": name, **rate_numbers(rate)} for name, rate in rates])
-    note = "Refused and failed runs count as not met. 95 %: Wilson's interval."
+    note = "Refused and failed runs count as not met. 95 %: Wilson's interval; none where runs share a procedure."
     return Table("success", "Success", note, ("", "runs", "rate", "95 %"), lines, data)
 
 
@@ -40,7 +40,8 @@ def trust_table(rows: pd.DataFrame) -> Table:
         if not sum(counts):
             continue
         lines.append(("whole run" if name is None else name, *map(str, counts), *rate_cells(found.harm)))
-        data.append({"object": name or "run", **vars(found), **rate_numbers(found.harm)})
+        names = ("right_trusted", "right_flagged", "wrong_trusted", "wrong_flagged")
+        data.append({"object": name or "run", **dict(zip(names, counts, strict=True)), **rate_numbers(found.harm)})
     columns = (
         "", "right, trusted", "right, flagged", "wrong, trusted", "wrong, flagged", "wrong of trusted", "95 %"
     )  # fmt: skip

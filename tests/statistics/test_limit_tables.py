@@ -56,11 +56,27 @@ def test_the_ratio_is_that_of_root_mean_squares_over_the_same_procedures() -> No
     limit, worth, shares = limit_tables(rows, bounds)
     line = next(row for row in limit.rows if row[0] == "entry point to tip, mm")
     # √((0.09 + 0.16) / 2), then √((0.0001 + 0.0049) / 2) = 0.05 and half of it
-    assert line == ("entry point to tip, mm", "0.354", "0.060", "0.025", "0.050", "7.1")
-    assert limit.columns == ("", "error", "noise alone", f"bound, {POSES_ALONE}", f"bound, {USUAL}", "ratio")
+    assert line == ("entry point to tip, mm", "2", "0.354", "0.060", "0.025", "0.050", "7.1")
+    assert limit.columns == ("", "runs", "error", "noise alone", f"bound, {POSES_ALONE}", f"bound, {USUAL}", "ratio")
     cells = dict(zip(worth.columns, worth.rows[1], strict=True))
     assert (cells["images"], cells["pelvis"], cells["device"]) == ("without device 1", "× 2.00", "× ∞")
     assert shares.rows[1] == ("device 1", *["75.0 %"] * 6)
+
+
+def test_a_run_without_an_error_has_no_part_in_the_bounds_beside() -> None:
+    rows = made_up(2)
+    rows["number"] = [1, 2]
+    rows["relative_mm"] = [0.3, float("nan")]
+    line = next(row for row in limit_tables(rows, made_up_bounds())[0].rows if row[0] == "entry point to tip, mm")
+    assert line[1:3] == ("1", "0.300")
+    assert line[5] == "0.010"  # of the first alone: √0.0001
+
+
+@pytest.mark.parametrize("column", ["number", "relative_mm"])
+def test_text_in_place_of_numbers_is_told(tmp_path: Path, column: str) -> None:
+    made_up_bounds().assign(**{column: "one"}).to_parquet(tmp_path / BOUNDS_NAME)
+    with pytest.raises(InputError, match=f"column {column}: numbers were expected"):
+        read_bounds(tmp_path)
 
 
 def test_bounds_of_another_condition_say_nothing() -> None:

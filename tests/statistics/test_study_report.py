@@ -109,7 +109,7 @@ def test_tables_are_printed_and_written_and_old_ones_go(folder: Path, capsys: py
     assert main(["tables", str(folder)]) == 0
     told = capsys.readouterr().out
     assert "Pose errors" in told
-    assert "22 simulated runs: 20 done, 1 refused, 1 failed" in " ".join(told.split())
+    assert "22 simulated runs of 12 procedures: 20 done, 1 refused, 1 failed" in " ".join(told.split())
     assert "the tables of 2 conditions are in the files" in " ".join(told.split())
     assert sorted(path.name for path in (folder / "tables").iterdir()) == [
         "all",

@@ -13,7 +13,7 @@ from study_frames import made_up, refuse
 
 from femoreg_torch.statistics.cause_tables import dependence_table
 from femoreg_torch.statistics.course_tables import round_table
-from femoreg_torch.statistics.error_tables import metric_table, pose_table
+from femoreg_torch.statistics.error_tables import error_table, metric_table, pose_table
 from femoreg_torch.statistics.formats import (
     Table,
     between,
@@ -106,11 +106,11 @@ def test_table_1_tells_absolute_errors_of_each_axis_and_the_paper_below() -> Non
     rows = made_up(4)
     rows["femur_mm_is"] = [-1.0, 1.0, 3.0, -3.0]
     table = pose_table(rows)
-    lines = {(first, what): cells for first, what, *cells in table.rows if first == "femur"}
+    lines = {(first, what): cells for first, _, what, *cells in table.rows if first == "femur"}
     assert lines["femur", "mean ± SD"][0] == "2.00 ± 1.15"
     after = table.rows.index(next(row for row in table.rows if row[0] == "femur"))
-    assert table.rows[after + 1][:3] == ("", "median", "2.00")
-    assert table.rows[after + 2][:3] == ("", "paper, mean ± SD", "0.14 ± 0.15")
+    assert table.rows[after + 1][:4] == ("", "", "median", "2.00")
+    assert table.rows[after + 2][:4] == ("", "", "paper, mean ± SD", "0.14 ± 0.15")
     assert table.rows[after + 3][-1] == "0.71"
     assert len(table.rows) == 5 * 4
 
@@ -119,8 +119,9 @@ def test_a_refused_run_is_counted_where_a_number_can_hold_it() -> None:
     rows = refuse(made_up(9, scale=0.1), [0, 1, 2, 3], "refused")
     rows = refuse(rows, [4], "failed", "killed")
     metrics = {row[0]: row for row in metric_table(rows).rows}
-    assert metrics["entry point to tip, mm"][2] == "∞"
-    assert math.isfinite(float(metrics["entry point to tip, mm"][1].split()[0]))
+    assert metrics["entry point to tip, mm"][1] == "4 of 9"
+    assert metrics["entry point to tip, mm"][3] == "∞"
+    assert math.isfinite(float(metrics["entry point to tip, mm"][2].split()[0]))
     assert "9 simulated runs: 4 done, 4 refused, 1 failed" in metric_table(rows).note
     success = {row[0]: row for row in success_table(rows).rows}
     assert success["entry point to tip ≤ 4 mm"][1:3] == ("4 of 9", "44.4 %")
@@ -129,6 +130,15 @@ def test_a_refused_run_is_counted_where_a_number_can_hold_it() -> None:
     assert trust["whole run"][1:5] == ("4", "0", "0", "5")
     overview = overview_table(rows).rows[0]
     assert overview[:4] == ("plain", "9", "4", "1")
+
+
+def test_conditions_of_the_same_procedures_tell_no_more_than_one() -> None:
+    rows = made_up(20, condition="plain")
+    seven = pd.concat([rows.assign(condition=str(n)) for n in range(7)], ignore_index=True)
+    one, many = (error_table(part, 0).data.set_index("error") for part in (rows, seven))
+    assert many.loc["femur_mm", "mean_low"] == pytest.approx(one.loc["femur_mm", "mean_low"])
+    assert "140 simulated runs of 20 procedures" in error_table(seven, 0).note
+    assert success_table(seven).rows[0][1:4] == ("140 of 140", "100.0 %", "–")
 
 
 def test_coverage_has_a_row_per_object_and_unit() -> None:

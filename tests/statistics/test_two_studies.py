@@ -15,17 +15,34 @@ def shifted(rows: pd.DataFrame, by: float, **columns: object) -> pd.DataFrame:
     return rows
 
 
+def alone(count: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.arange(count), np.arange(count)
+
+
+def test_runs_of_one_procedure_do_not_make_a_difference_clearer() -> None:
+    """Twenty differences told seven times are twenty differences."""
+    one, other = (pd.Series(np.random.default_rng(seed).normal(size=20)) for seed in (0, 1))
+    pairs = pd.DataFrame({"first": range(20), "second": range(20)})
+    told_once = difference(one, other, pairs, alone(20), 0)
+    many = [pd.concat([values] * 7, ignore_index=True) for values in (one, other)]
+    clusters = np.tile(np.arange(20), 7)
+    pairs = pd.DataFrame({"first": range(140), "second": range(140)})
+    repeated = difference(*many, pairs, (clusters, clusters), 0)
+    assert repeated.interval == pytest.approx(told_once.interval)
+    assert np.isnan(difference(*many, None, (clusters, clusters), 0).interval[0])
+
+
 def test_the_same_procedures_are_paired_and_a_small_difference_is_clear() -> None:
     """0.05 mm is a tenth of the spread between procedures: clear only where each is held against itself."""
     first = made_up(60)
     second = shifted(first, 0.05, condition="other", study="other").sample(frac=1, random_state=1)
     pairs = matched(second, first)
     assert pairs is not None
-    found = difference(told(second, "relative_mm"), told(first, "relative_mm"), pairs, 0)
+    found = difference(told(second, "relative_mm"), told(first, "relative_mm"), pairs, alone(60), 0)
     assert (found.counts, found.paired, found.clear) == ((60, 60), True, True)
     assert found.interval[0] < 0.05 < found.interval[1]
     assert found.interval[1] - found.interval[0] < 0.01
-    unpaired = difference(told(second, "relative_mm"), told(first, "relative_mm"), None, 0)
+    unpaired = difference(told(second, "relative_mm"), told(first, "relative_mm"), None, alone(60), 0)
     assert not unpaired.clear
     assert unpaired.value == pytest.approx(found.value)
 

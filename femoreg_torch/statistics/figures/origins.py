@@ -11,7 +11,7 @@ _HATCHES = ("", "///", "...")  # so that the bars stay apart in print without co
 
 def origins(rows: pd.DataFrame) -> Plot | None:
     """A bar for every response, divided among the groups; None where there are too few runs for a regression."""
-    found = relative_origins(rows, None)
+    found = relative_origins(rows)
     if not found:
         return None
     figure = new_figure(SINGLE_MM, 26 + 9 * len(found))
