@@ -117,7 +117,13 @@ def read_marks(path: Path, names: list[str], case: Case) -> dict[str, tuple[Mark
     of the first one. Raises `InputError` that names file and line.
     """
     rows = read_csv(path, COLUMNS)
-    images = {image.name: image.name for view in case.views for image in view.images.values()}
+    names_of_images = [image.name for view in case.views for image in view.images.values()]
+    if repeated := sorted({name for name in names_of_images if names_of_images.count(name) > 1}):
+        raise InputError(
+            f"{path}: two images of the case are called {shortened(repeated[0])}, and marks go by this name. Rename "
+            "one."
+        )
+    images = {name: name for name in names_of_images}
     images |= {Path(name).stem: name for name in images}
     rows_px, columns_px = case.carm.camera.shape
     found: dict[str, list[Mark]] = {}

@@ -12,15 +12,16 @@ from femoreg_torch.volume import read_landmarks
 
 COLUMNS = ("landmark", "column_px", "row_px")
 _POSE = "camera1_from_"
+_VISIBLE = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}  # as spreadsheets write them
 _FARTHEST_PX = 1e5  # of a landmark, which may lie outside of the image
 
 
 def read_pixels(path: Path) -> dict[str, Tensor]:
     """Landmarks (2,), column and row in pixels of the image as stored, by name.
 
-    A CSV file with the columns landmark, column_px and row_px; where it has a column `visible`, rows with 0 are left
-    out, and where it has a column `image`, all rows must be of one image. Or 3D Slicer markups and `.fcsv` files of the
-    image plane: x is the column, y the row, in the space LPS. Raises `InputError` that names file and row.
+    A CSV file with the columns landmark, column_px and row_px; where it has a column `visible`, rows with 0 or false
+    are left out, and where it has a column `image`, all rows must be of one image. Or 3D Slicer markups and `.fcsv`
+    files of the image plane: x is the column, y the row, in the space LPS. Raises `InputError` that names file and row.
     """
     path = Path(path)
     if not path.is_file():
@@ -33,7 +34,10 @@ def read_pixels(path: Path) -> dict[str, Tensor]:
     found: dict[str, Tensor] = {}
     for number, row in enumerate(rows, 2):
         name = row["landmark"]
-        if row.get("visible", "1") in ("0", "False", "false"):
+        visible = _VISIBLE.get((row.get("visible") or "1").strip().lower())
+        if visible is None:
+            raise InputError(f"{path}, line {number}: visible: 1 or 0 was expected, found {shortened(row['visible'])}.")
+        if not visible:
             continue
         if not name or name in found:
             raise InputError(

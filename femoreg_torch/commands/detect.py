@@ -47,6 +47,7 @@ def detect(
         attenuation_image,
         check_matches,
         exposed_field,
+        intensity_of,
         read_stored,
         settled_intensity,
     )
@@ -69,7 +70,7 @@ def detect(
     for path, image in zip(images, stored, strict=True):
         upright = display.to_camera(image.values)
         raw = settled_intensity(intensity, image, str(path)) == "raw"
-        field = exposed_field(upright if raw else (-upright).exp(), camera)
+        field = exposed_field(upright if raw else intensity_of(upright), camera)
         shown = attenuation_image(upright, field) if raw else upright
         shown = shown if field is None else filled(shown, field)
         found = find(network, shown, camera)

@@ -5,7 +5,15 @@ from femoreg_torch.fluoro.dicom import Frames, carm_settings, read_header
 from femoreg_torch.fluoro.display import SOURCES, TURNS, Display, Source
 from femoreg_torch.fluoro.distortion import Distortion, GridImage, find_distortion, find_grid_spots
 from femoreg_torch.fluoro.field import Circle, Polygon
-from femoreg_torch.fluoro.intensity import attenuation_image, binned, downsample, natural
+from femoreg_torch.fluoro.intensity import (
+    attenuation_image,
+    below_zero,
+    binned,
+    check_intensity,
+    downsample,
+    intensity_of,
+    natural,
+)
 from femoreg_torch.fluoro.reading import (
     StoredImage,
     check_matches,
@@ -31,9 +39,11 @@ __all__ = [
     "StoredImage",
     "Tags",
     "attenuation_image",
+    "below_zero",
     "binned",
     "carm_settings",
     "check_header",
+    "check_intensity",
     "check_matches",
     "contradictions",
     "downsample",
@@ -41,6 +51,7 @@ __all__ = [
     "find_distortion",
     "find_grid_spots",
     "find_shutter",
+    "intensity_of",
     "may_be_image",
     "natural",
     "nearest_side",

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from femoreg_torch.arrays import check_pixels, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro.tags import Tags, find_value, read_tags, value_in
+from femoreg_torch.volume.dicom import damaged_header
 
 Frames = tuple[int, ...] | Literal["mean"]  # of a cine run: numbers from 1, averaged, or all of them
 Values = NDArray[Any]
@@ -66,7 +67,8 @@ def carm_settings(path: Path) -> dict[str, Any]:
 
 def read_header(path: Path) -> Tags:
     """What the header of a DICOM image says. Raises `InputError`."""
-    return _tags(_dataset(path, stop_before_pixels=True), path)
+    with damaged_header(path):
+        return _tags(_dataset(path, stop_before_pixels=True), path)
 
 
 def _dataset(path: Path, **options: Any) -> Any:

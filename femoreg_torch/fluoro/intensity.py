@@ -10,6 +10,8 @@ from femoreg_torch.errors import InputError
 
 _MOST_ATTENUATION = 12.0  # of a patient: 45 cm of water at 60 keV are 9
 _EXTREME = 60.0  # attenuation of which float32 can still take the intensity
+_USUAL_RANGE = 8.0  # of attenuation in an image of a hip
+_MOST_BELOW_ZERO = 0.01  # share of pixels; noise of a dark detector leaves fewer where a patient lies
 _SPARSE = 8  # every so many-th pixel tells what half of an image is
 _SIGMA_PX = math.sqrt(2.0)  # of the smoothing that finds I0: variance 2 px², as xReg does (itkIntensLogTrans)
 
@@ -21,12 +23,37 @@ def attenuation_image(raw: Tensor, field: Tensor | None = None) -> Tensor:
     all of it), so that no single hot pixel sets it; where a pixel counts more, its attenuation is slightly negative.
     Pixels of zero or less count as the smallest positive pixel. Raises `InputError` if no pixel is positive.
     """
+    check_intensity(raw, "image")
     positive = raw[raw > 0]
-    if positive.numel() == 0:
-        raise InputError("image: no pixel is positive, a raw intensity image was expected. Is its intensity `log`?")
     smooth = cv2.GaussianBlur(raw.float().numpy(), (0, 0), _SIGMA_PX, borderType=cv2.BORDER_REPLICATE)
     open_beam = smooth.max() if field is None else smooth[field.numpy()].max()
     return math.log(float(open_beam)) - raw.float().clamp_min(positive.min().item()).log()
+
+
+def intensity_of(attenuation: Tensor) -> Tensor:
+    """Intensities (H, W), up to a factor, whose logarithms an attenuation image holds; at most 1.
+
+    Values that are not `natural` are of another scale: they are brought to a range of `_USUAL_RANGE` first.
+    """
+    above = attenuation - attenuation.min()
+    return (-(above if natural(attenuation) else above * (_USUAL_RANGE / above.max()))).exp()
+
+
+def below_zero(raw: Tensor, padding: Tensor | None = None) -> str | None:
+    """In words, that many pixels of a raw image (H, W) lie below 0; None if few do. `padding`, bool, holds no image."""
+    share = float((raw < 0 if padding is None else (raw < 0) & ~padding).double().mean())
+    if share <= _MOST_BELOW_ZERO:
+        return None
+    return (
+        f"has {100 * share:.0f} % of its pixels below 0, and no intensity is: was too much taken off for the dark "
+        "detector? They count as the darkest pixel above 0"
+    )
+
+
+def check_intensity(raw: Tensor, where: str) -> None:
+    """Raises `InputError` that starts with `where` if no pixel of a raw image is positive."""
+    if not (raw > 0).any():
+        raise InputError(f"{where}: no pixel is positive, a raw intensity image was expected. Is its intensity `log`?")
 
 
 def downsample(image: Tensor, factor: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Literal
 
@@ -9,6 +10,8 @@ import cv2
 import numpy as np
 import SimpleITK as sitk
 import torch
+from PIL import Image
+from PIL.TiffImagePlugin import PHOTOMETRIC_INTERPRETATION, TiffImageFile
 from torch import Tensor
 
 from femoreg_torch.arrays import MOST_PIXELS, quiet
@@ -60,12 +63,25 @@ def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
             f"{path}: cannot be read as a PNG, TIFF or JPEG image of at most {MOST_PIXELS} pixels; the file is damaged "
             "or something else."
         )
+    remarks = []
+    if path.suffix.lower() in _PAGED_SUFFIXES and image.dtype != np.uint8 and _white_is_zero(content):
+        if image.dtype != np.uint16:
+            raise InputError(f"{path}: says that 0 is white (WhiteIsZero). Save it with 0 as black (BlackIsZero).")
+        image = np.iinfo(np.uint16).max - image  # of 8 bits OpenCV has done so
+        remarks.append("says that 0 is white (WhiteIsZero): its values were turned over")
     screen = path.suffix.lower() in _SCREEN_SUFFIXES or (path.suffix.lower() == ".png" and image.dtype == np.uint8)
     if image.ndim == 3 and image.shape[-1] in (3, 4):
         colours = image[..., :3].astype(np.int64)
         if np.ptp(colours, axis=-1).max() <= (_GREY_STEPS if path.suffix.lower() in _SCREEN_SUFFIXES else 0):
             image, screen = image[..., 1], True
-    return image, (SCREEN,) if screen else ()
+    return image, (*remarks, SCREEN) if screen else tuple(remarks)
+
+
+def _white_is_zero(tiff: bytes) -> bool:
+    """Whether a TIFF file says that its least value is white (tag 262, PhotometricInterpretation, is 0)."""
+    with suppress(OSError, SyntaxError, ValueError), Image.open(BytesIO(tiff)) as picture:
+        return isinstance(picture, TiffImageFile) and picture.tag_v2.get(PHOTOMETRIC_INTERPRETATION) == 0
+    return False  # what Pillow does not know of
 
 
 def _read_itk(path: Path) -> np.ndarray:

@@ -41,7 +41,7 @@ from femoreg_torch.intake.planes import Picture, side_by_side, stacked
 from femoreg_torch.intake.start_picture import picture_of_start
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.registration.models import model_attenuation
-from femoreg_torch.volume import read_ct_told, read_landmarks
+from femoreg_torch.volume import is_in_ras, read_ct_told, read_landmarks
 from femoreg_torch.volume.borders import cut_bones
 
 _ANY_PATH = PlannedPath(FEMUR, torch.zeros(3).double(), torch.ones(3).double())
@@ -139,6 +139,11 @@ def _check_device(top: Fields, folder: Path, path: PlannedPath | None, side: Sid
         return
     found.unknown_keys(device, (*MODEL_KEYS, "points", *femoroplasty_form.DEVICE_STARTS))
     model = found.attempt(lambda: read_model(device, folder))
+    if model is not None and model.path.is_file() and is_in_ras(model.path):
+        found.warnings.append(
+            f"{model.path.name} says that its coordinates are RAS, and they are taken as they stand: the points of the "
+            "device have to be in the same space"
+        )
     points = _device_points(device, folder, found)
     volume = None if model is None else found.attempt(lambda: model_attenuation(model).volume)
     if volume is not None:

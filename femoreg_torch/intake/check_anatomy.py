@@ -23,10 +23,13 @@ from femoreg_torch.volume import (
     Volume,
     bone_labels,
     check_inside,
+    merged_bones,
+    misplaced_labels,
     read_ct_told,
     read_labels_told,
     stray_landmarks,
     swapped_sides,
+    wrong_hounsfield,
 )
 from femoreg_torch.volume.bones import nearest_label
 
@@ -67,8 +70,12 @@ def check_bones(
     path: Path, ct: Volume, table: LabelTable, anatomy: Anatomy | None, marks: Mapping[str, Tensor], found: Found
 ) -> BoneLabels:
     labels, told = read_labels_told(path, ct, {n for ids in table.values() for n in ids})
-    found.warnings += told
+    found.warnings += [*told, *header_warnings(path)]
     bones = bone_labels(labels, ct, table, anatomy, marks)
+    if (wrong := wrong_hounsfield(ct, bones.labels)) is not None:
+        found.problem(f"{wrong}.")
+    elif (misplaced := misplaced_labels(ct, bones.labels, list(bones.ids.values()))) is not None:
+        found.warnings.append(misplaced)
     found.facts.append(f"bones: {', '.join(bones.ids)}")
     for bone, ids in bones.absent.items():
         numbers = ", ".join(map(str, ids))
@@ -95,7 +102,8 @@ def check_landmarks(seen: SeenAnatomy, found: Found) -> None:
     if seen.bones is not None:
         inside = {name: point for name, point in seen.landmarks.items() if name not in outside}
         swapped = swapped_sides(seen.bones, inside, seen.anatomy)
-        for told in swapped or stray_landmarks(seen.bones, inside, seen.anatomy):
+        merged = merged_bones(seen.bones, inside, seen.anatomy)
+        for told in swapped or [*stray_landmarks(seen.bones, inside, seen.anatomy), *merged]:
             found.problem(f"{told}.")
 
 

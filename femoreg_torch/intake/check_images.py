@@ -1,9 +1,9 @@
 """What is wrong with the views of a case and their images."""
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -23,9 +23,22 @@ from femoreg_torch.case.parts import (
     read_known_pose,
 )
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import Display, check_header, check_matches, read_stored, settled_intensity
+from femoreg_torch.fluoro import (
+    Circle,
+    Display,
+    GridImage,
+    Polygon,
+    below_zero,
+    check_header,
+    check_intensity,
+    check_matches,
+    find_distortion,
+    read_image,
+    read_stored,
+    settled_intensity,
+)
 from femoreg_torch.fluoro.reading import LOOKS_LOG
-from femoreg_torch.geometry import CArm
+from femoreg_torch.geometry import Camera, CArm
 from femoreg_torch.intake.found import Found
 
 _LOOK_PX = 96  # images are compared at about so many pixels across
@@ -60,15 +73,22 @@ def check_views(
     if not views:
         found.problem(f"{top.where('views')}: empty. At least one fluoroscopic image is needed.")
     read: dict[str, Tensor] = {}
+    poses: dict[str, Tensor] = {}
     for view in views:
         found.unknown_keys(view, (ANATOMY_IMAGES, DEVICE_IMAGES, *VIEW_KEYS))
-        by_folder = (lambda one: read_field(one, folder), lambda one: read_grid(one, folder))
-        for get in (read_known_pose, *by_folder):
-            found.attempt(lambda get=get, view=view: cast(Callable[[Fields], Any], get)(view))  # type: ignore[misc]
+        pose = found.attempt(lambda view=view: read_known_pose(view))  # type: ignore[misc]
+        if pose is not None:
+            poses[view.path] = pose
+        field = found.attempt(lambda view=view: read_field(view, folder))  # type: ignore[misc]
+        grid = found.attempt(lambda view=view: read_grid(view, folder))  # type: ignore[misc]
         shown = found.attempt(lambda view=view: read_display(view)) if "display" in view else display  # type: ignore[misc]
         looked_at = found.attempt(
             lambda view=view, shown=shown: View({}, read_intensity(view), frames=read_frames(view), display=shown)  # type: ignore[misc]
         )
+        if carm is not None and shown is not None:
+            camera = shown.stored_camera(carm.camera)
+            found.attempt(partial(_check_field, field, camera, view.where("field")))
+            found.attempt(partial(_check_grid, grid, camera, view.where("grid")))
         for kind in (ANATOMY_IMAGES, DEVICE_IMAGES):
             if kind == DEVICE_IMAGES and kind not in view:
                 continue
@@ -76,6 +96,9 @@ def check_views(
             if path is not None and looked_at is not None:
                 _check_image(path, looked_at, carm, view.where(kind), read, found)
     _check_different(read, found)
+    for (one, first), (other, second) in itertools.combinations(poses.items(), 2):
+        if torch.allclose(first, second, atol=1e-6):
+            found.warnings.append(f"{one} and {other} are given one and the same pose of the C-arm")
     _check_exchanged(_by_key(read), ANATOMY_IMAGES, found)
     if DEVICE in top and views and not any(DEVICE_IMAGES in view for view in views):
         found.warnings.append("no view has an image with the device, so it will not be found")
@@ -106,13 +129,38 @@ def _check_image(path: Path, view: View, carm: CArm | None, where: str, read: di
         return
     read[where] = stored.values
     found.warnings += [f"{path.name} {remark}" for remark in stored.remarks]
-    found.attempt(lambda: settled_intensity(view.intensity, stored, f"{where}: {path.name}"))
+    settled = found.attempt(lambda: settled_intensity(view.intensity, stored, f"{where}: {path.name}"))
+    if settled == "raw":
+        found.attempt(lambda: check_intensity(stored.values, f"{where}: {path.name}"))
+        if (dark := below_zero(stored.values, stored.padding)) is not None:
+            found.warnings.append(f"{path.name} {dark}")
     if view.intensity == "raw" and stored.asks == LOOKS_LOG:
         found.warnings.append(f"{path.name} {LOOKS_LOG}, but the case says `intensity: raw`: bone is to be dark in it")
     if carm is not None and view.display is not None:
         shown, camera = view.display, view.display.stored_camera(carm.camera)
         found.attempt(lambda: check_matches(stored.values, camera, f"{where}: it"))
         found.attempt(lambda: check_header(stored.tags, camera, shown, carm.uncertainty, f"{where}: {path.name}"))
+
+
+def _check_field(field: Circle | Polygon | Path | None, camera: Camera, where: str) -> None:
+    """Raises `InputError` for shutters that leave nothing of the stored picture, and a mask of another size."""
+    if field is None:
+        return
+    if isinstance(field, Path):
+        exposed = read_image(field)
+        check_matches(exposed, camera, f"{where}: it")
+    else:
+        exposed = field.exposed(camera.shape)
+    if not (exposed > 0).any():
+        raise InputError(f"{where}: exposes no pixel of the image.")
+
+
+def _check_grid(grid: GridImage | None, camera: Camera, where: str) -> None:
+    """Raises `InputError` for an image in which no grid is found, or of another size."""
+    if grid is not None:
+        image = read_image(grid.path)
+        check_matches(image, camera, f"{where}: it")
+        find_distortion(image, camera, grid.pitch_mm, where)
 
 
 def _check_different(images: Mapping[str, Tensor], found: Found) -> None:

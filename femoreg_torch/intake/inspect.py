@@ -33,7 +33,7 @@ from femoreg_torch.volume import (
     segment_names,
 )
 from femoreg_torch.volume.borders import cut_bones
-from femoreg_torch.volume.dicom import is_dicom, series_in
+from femoreg_torch.volume.dicom import damaged_header, is_dicom, series_in
 from femoreg_torch.volume.mesh_files import bounds_of
 from femoreg_torch.volume.segments import SEGMENTATION_SUFFIX
 
@@ -150,6 +150,11 @@ def _in_short(entry: Path) -> str:
 
 
 def _dicom_file(path: Path) -> Findings:
+    with damaged_header(path):
+        return _of_dicom(path)
+
+
+def _of_dicom(path: Path) -> Findings:
     import pydicom
 
     header = pydicom.dcmread(path, stop_before_pixels=True, force=True)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
+import SimpleITK as sitk
 import torch
 import yaml
 from torch import Tensor
@@ -40,6 +41,7 @@ from femoreg_torch.volume import (
 )
 from femoreg_torch.volume.bones import nearest_label
 from femoreg_torch.volume.dicom import is_dicom
+from femoreg_torch.volume.itk import DETACHED, read_itk
 
 NEEDED = ("ct", "labels", "landmarks", "plan", "images")
 _COPIED = (".nii", ".nii.gz", ".nrrd", ".mha")  # volumes of one file, which are taken as they are
@@ -210,7 +212,13 @@ def _ct(folder: Path, path: Path, ct: Volume) -> str:
 
 
 def _copied(path: Path, folder: Path, stem: str) -> str:
-    """Copy a file under a name that says what it is, and return that name."""
+    """Copy a file under a name that says what it is, and return that name.
+
+    A header whose values stand in a file of their own is written together with them.
+    """
+    if path.name.lower().endswith(DETACHED):
+        sitk.WriteImage(read_itk(path), str(folder / f"{stem}.mha"))
+        return f"{stem}.mha"
     suffix = next((s for s in (".seg.nrrd", ".nii.gz") if path.name.lower().endswith(s)), path.suffix.lower())
     name = stem + (suffix or ".dcm")
     shutil.copyfile(path, folder / name)

@@ -17,6 +17,7 @@ from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
 from femoreg_torch.intake.planes import Picture
 from femoreg_torch.registration import Scene, prepare_scene
+from femoreg_torch.registration.doubts import doubts_about_the_guide
 from femoreg_torch.registration.run import network_detector
 from femoreg_torch.registration.start import look_at, start_by_detection, start_by_landmarks
 
@@ -50,7 +51,11 @@ def picture_of_start(case: Case, landmarks: Mapping[str, Tensor] | None = None) 
     poses = scene.start(None if record is None else record.camera1_from_object)
     panels = [_panel(case, scene, poses, kind) for kind in scene.images if scene.images[kind][0] is not None]
     models = [name for name, thing in case.objects.items() if thing.model is not None]
-    warnings = (*hardly_shown(scene, poses, models), *path_out_of_view(case.plan, scene, poses))
+    warnings = (
+        *hardly_shown(scene, poses, models),
+        *path_out_of_view(case.plan, scene, poses),
+        *doubts_about_the_guide(case, poses),
+    )
     return StartPicture(np.hstack(panels), tuple(facts), warnings)
 
 

@@ -20,6 +20,9 @@ _SOFT_HU, _BONE_HU, _METAL_HU = -50.0, 300.0, 2800.0
 _LEAST_AIR = 0.005  # share of the voxels; beside every patient there is some
 _METAL_ML = 1.0
 _DISAGREE_MM = 0.5
+_SPACES_WITHOUT_A_PATIENT = tuple(
+    name + time for name in (b"scanner-xyz", b"3d-right-handed", b"3d-left-handed") for time in (b"", b"-time")
+)  # NRRD format, section 5.1
 _NRRD_HEADER = 2**16  # bytes that hold it
 
 
@@ -86,9 +89,15 @@ def header_warnings(path: Path) -> list[str]:
     if path.name.lower().endswith((".nrrd", ".nhdr")):
         with opened(path) as file:
             header = file.read(_NRRD_HEADER).partition(b"\n\n")[0]
-        if re.search(rb"^space:", header, re.MULTILINE):
-            return []
-        return ["the NRRD header names no `space`: its axes are assumed to run to the left, back and head"]
+        told = re.search(rb"^space:[ \t]*(.*?)[ \t\r]*$", header, re.MULTILINE | re.IGNORECASE)
+        if told is None:
+            return ["the NRRD header names no `space`: its axes are assumed to run to the left, back and head"]
+        if told[1].lower() in _SPACES_WITHOUT_A_PATIENT:
+            return [
+                f"the NRRD header names the `space` {told[1].decode()}, which says nothing of a patient: its axes are "
+                "assumed to run to the left, back and head"
+            ]
+        return []
     if not path.name.lower().endswith((".nii", ".nii.gz")):
         return []
     image: Any = nibabel.load(path)  # its declared type is that of all formats
@@ -96,7 +105,8 @@ def header_warnings(path: Path) -> list[str]:
     codes = int(header["sform_code"]), int(header["qform_code"])
     if codes == (0, 0):
         return [
-            "the NIfTI header has neither sform nor qform: its axes are assumed to run to the right, front and head"
+            "the NIfTI header has neither sform nor qform: its axes are taken to run to the left, back and head, as "
+            "ITK and 3D Slicer take them; by the standard they run to the right, front and head"
         ]
     if min(codes) == 0:
         return []

@@ -82,14 +82,21 @@ def read_specimen(path: Path, name: str) -> Specimen:
         }
         ct = _volume(file, f"{name}/vol", np.float32, path)
         labels = _volume(file, f"{name}/vol-seg/image", np.uint8, path)
+    if labels.data.shape != ct.data.shape:
+        raise InputError(f"{path}, {name}: its label map has another size than its CT. Download the file again.")
     return Specimen(name, ct, labels, landmarks)
 
 
 def _volume(file: Hdf5File, name: str, dtype: Any, path: Path) -> Volume:
-    values = file.numbers(f"{name}/pixels", 3).astype(dtype)
+    stored = file.numbers(f"{name}/pixels", 3)
+    values = stored.astype(dtype)
+    if dtype == np.uint8 and (values != stored).any():
+        raise InputError(f"{path}, {name}: labels are whole numbers from 0 to 255, and some are not.")
     affine = torch.eye(4, dtype=torch.float64)
-    spacing = file.matrix(f"{name}/spacing", (3,))
-    affine[:3, :3] = file.matrix(f"{name}/dir-mat", (3, 3)) @ torch.diag(spacing)
+    spacing, axes = file.matrix(f"{name}/spacing", (3,)), file.matrix(f"{name}/dir-mat", (3, 3))
+    if not bool((spacing > 0).all()) or not torch.allclose(axes.T @ axes, torch.eye(3).to(axes), atol=1e-3):
+        raise InputError(f"{path}, {name}: a spacing is not above 0, or its axes are not at right angles.")
+    affine[:3, :3] = axes @ torch.diag(spacing)
     affine[:3, 3] = file.matrix(f"{name}/origin", (3,))
     return Volume(torch.from_numpy(values), affine)
 

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from femoreg_torch.arrays import MOST_PIXELS, check_pixels
 from femoreg_torch.errors import InputError
+from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import invert_rigid, read_itk_transform
 from femoreg_torch.hdf5 import Hdf5File, open_hdf5
 from femoreg_torch.neighbours.frames import XregCamera
@@ -86,8 +87,12 @@ def read_transform(path: Path) -> Tensor:
 
 
 def write_transform(path: Path, matrix: Tensor) -> None:
-    """Write a rigid matrix (4, 4) as an ITK affine transform, `.h5` or `.tfm`, as it takes points."""
+    """Write a rigid matrix (4, 4) as an ITK affine transform, `.h5` or `.tfm`, as it takes points. Raises `OSError`."""
     transform = sitk.AffineTransform(3)
     transform.SetMatrix(matrix[:3, :3].double().flatten().tolist())
     transform.SetTranslation(matrix[:3, 3].double().tolist())
-    sitk.WriteTransform(transform, str(path))
+    with temporary_file(Path(path)) as part:
+        try:
+            sitk.WriteTransform(transform, str(part))
+        except RuntimeError as error:  # ITK does not say why
+            raise OSError(f"{path}: cannot be written") from error

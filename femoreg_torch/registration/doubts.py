@@ -11,6 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from femoreg_torch.case import Case
+from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Poses, orbit_angles, pose_difference, transform_points
@@ -73,6 +74,7 @@ def doubts(
         lambda: doubts_about_the_views(scene, poses),
         lambda: doubts_about_motion(covariance),
         lambda: doubts_about_the_plan(case, scene),
+        lambda: doubts_about_the_guide(case, poses),
         lambda: doubts_about_the_models(told, scene),
     ]
     found = on_all_cores(lambda ask: ask(), others, scene.device)
@@ -202,6 +204,18 @@ def doubts_about_the_plan(case: Case, scene: Scene) -> tuple[str, ...]:
     if away.max() > _MOST_FROM_BONE_MM:
         return (f"the planned path leaves the {plan.object} by {away.max():.0f} mm: check `plan`",)
     return ()
+
+
+def doubts_about_the_guide(case: Case, poses: Poses) -> tuple[str, ...]:
+    """A guide that points out of the bone, away from the planned path, in words."""
+    directions = path_in_camera1(case, poses)[1]
+    if "guide" not in directions or float(directions["guide"] @ directions["path"]) > 0:
+        return ()
+    assert case.plan is not None  # it has the path
+    return (
+        f"the guide of the {case.plan.tool} points against the planned path: are its points `tip` and `base` "
+        "exchanged, or entry point and target of the plan?",
+    )
 
 
 def doubts_about_the_models(told: Scene, scene: Scene) -> tuple[str, ...]:

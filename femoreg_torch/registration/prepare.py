@@ -18,10 +18,13 @@ from femoreg_torch.fluoro import (
     Polygon,
     StoredImage,
     attenuation_image,
+    below_zero,
     check_header,
+    check_intensity,
     check_matches,
     find_distortion,
     find_shutter,
+    intensity_of,
     read_image,
     read_stored,
     settled_intensity,
@@ -38,11 +41,13 @@ from femoreg_torch.volume import (
     check_inside,
     hu_to_attenuation,
     label_box_centre,
+    merged_bones,
     read_ct_told,
     read_labels_told,
     resample_isotropic,
     structure_attenuation,
     swapped_sides,
+    wrong_hounsfield,
 )
 
 REGISTRATION_SPACING_MM = 1.0  # the paper resamples the CT to 1 mm (section III-A)
@@ -67,8 +72,7 @@ def prepare_scene(case: Case) -> Scene:
         if from_ct:
             ct, bones = read_bones(case)
             check_inside(case.landmarks, ct)
-            if swapped := swapped_sides(bones, case.landmarks, case.anatomy):
-                raise InputError(f"{case.folder}: {'; '.join(swapped)}.")
+            _check_anatomy(case, ct, bones)
             _check_path(case, ct)
             soft = resample_isotropic(ct.with_data(ct.data.clamp_max(SOFT_HU)), TISSUE_SPACING_MM)
             tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
@@ -107,6 +111,17 @@ def prepare_scene(case: Case) -> Scene:
         left_on_left=tuple(view for view in range(len(case.views)) if case.display_of(view).left_on_left),
         missing=told,
     )
+
+
+def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> None:
+    """Raises `InputError` if CT, label map and landmarks contradict one another."""
+    told = [
+        *swapped_sides(bones, case.landmarks, case.anatomy),
+        *merged_bones(bones, case.landmarks, case.anatomy),
+        *filter(None, [wrong_hounsfield(ct, bones.labels)]),
+    ]
+    if told:
+        raise InputError(f"{case.folder}: {'; '.join(told)}.")
 
 
 def _check_path(case: Case, ct: Volume) -> None:
@@ -276,15 +291,18 @@ def _read_image(case: Case, index: int, kind: Kind) -> _Image:
     distortion = view_distortion(case, index)
     straight = stored.values if distortion is None else distortion.straightened(stored.values)
     image = display.to_camera(straight)
-    raw = (-image).exp() if logarithms else image
+    raw = intensity_of(image) if logarithms else image
+    if not logarithms:
+        check_intensity(raw, file)
     field, shutter = _field(case, index, stored, raw, distortion)
     if field is not None and not field.any():
         told_by = f"{case.folder}/case.yaml, views[{index}].field" if view.field is not None else f"{where}: its header"
         raise InputError(f"{told_by}: exposes no pixel of the image.")
     bent = [] if distortion is None else [_told_distortion(distortion)]
+    dark = None if logarithms else below_zero(stored.values, stored.padding)
     remarks = (
         *bent,
-        *(f"{view.images[kind].name} {remark}" for remark in stored.remarks),
+        *(f"{view.images[kind].name} {remark}" for remark in (*stored.remarks, *filter(None, [dark]))),
         *([shutter] if shutter else []),
     )
     return _Image(

@@ -2,6 +2,7 @@
 
 from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
 from femoreg_torch.volume.bones import BoneLabels, bone_labels
+from femoreg_torch.volume.contradictions import misplaced_labels, wrong_hounsfield
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
 from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
 from femoreg_torch.volume.labels import label_box_centre, looked_up
@@ -20,7 +21,7 @@ from femoreg_torch.volume.reading import (
 )
 from femoreg_torch.volume.resample import crop, halved, resample_isotropic, sharpened
 from femoreg_torch.volume.segments import has_names, segment_names
-from femoreg_torch.volume.sides import stray_landmarks, swapped_sides
+from femoreg_torch.volume.sides import merged_bones, stray_landmarks, swapped_sides
 from femoreg_torch.volume.solids import Solid, solid_volumes
 
 __all__ = [
@@ -42,6 +43,8 @@ __all__ = [
     "label_share",
     "labelled_device",
     "looked_up",
+    "merged_bones",
+    "misplaced_labels",
     "read_bodies",
     "read_ct",
     "read_ct_told",
@@ -64,4 +67,5 @@ __all__ = [
     "voxelise_mesh",
     "write_landmarks",
     "write_volume",
+    "wrong_hounsfield",
 ]

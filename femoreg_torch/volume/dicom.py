@@ -7,6 +7,7 @@ missing slices, and over the shear of a tilted gantry.
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -16,7 +17,7 @@ import SimpleITK as sitk
 from numpy.typing import NDArray
 
 from femoreg_torch.arrays import opened
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 
 _TAGS = (
     "SOPInstanceUID", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "ImageType", "Rows",
@@ -126,19 +127,28 @@ def _headers(folder: Path) -> Iterator[Slice]:
             yield _slice(path)
 
 
+@contextmanager
+def damaged_header(path: Path) -> Iterator[None]:
+    """Whatever pydicom's reading of a header runs into is an `InputError` that names the file."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # pydicom's parsing raises whatever the bytes lead it to
+        raise InputError(
+            f"{path}: its DICOM header cannot be read ({shortened(error)}). Export it anew, or take the file away."
+        ) from error
+
+
 def _slice(path: Path) -> Slice:
     """Some tags of a DICOM file. Raises `InputError`."""
     import pydicom  # a fifth of a second, and most CTs are of other kinds
-    from pydicom.errors import InvalidDicomError
 
-    try:
-        with path.open("rb") as file:
-            header = pydicom.dcmread(file, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
-            return Slice(path, header, _holds_pixels(file, header, path.stat().st_size))
-    except (InvalidDicomError, OSError, ValueError, AttributeError, KeyError) as error:
-        raise InputError(
-            f"{path}: its DICOM header cannot be read ({error}). Export the series anew, or take the file away."
-        ) from error
+    with damaged_header(path), path.open("rb") as file:
+        header = pydicom.dcmread(file, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
+        for tag in header.keys():  # noqa: SIM118  # a value is parsed when it is first asked for
+            header[tag]
+        return Slice(path, header, _holds_pixels(file, header, path.stat().st_size))
 
 
 def _holds_pixels(file: BinaryIO, header: Any, size: int) -> bool:

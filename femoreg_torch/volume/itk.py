@@ -10,7 +10,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.volume.nifti import NIFTI_SUFFIXES, check_nifti
 from femoreg_torch.volume.text_headers import META_SUFFIXES, NRRD_SUFFIXES, check_text_header
 
-_DETACHED = (".mhd", ".nhdr", ".hdr", ".img")  # headers, or values, alone
+DETACHED = (".mhd", ".nhdr", ".hdr", ".img")  # headers, or values, alone
 _READERS = {"NiftiImageIO": NIFTI_SUFFIXES, "MetaImageIO": META_SUFFIXES, "NrrdImageIO": NRRD_SUFFIXES}
 
 
@@ -30,6 +30,10 @@ def read_itk(path: Path) -> sitk.Image:
             image = _read_file(path)
     except (RuntimeError, MemoryError, UnicodeDecodeError, OverflowError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[-1].removeprefix("sitk::ERROR: ")
+        if "orthonormal" in str(error):
+            raise InputError(
+                f"{path}: its axes are not at right angles. Resample it onto a grid whose axes are."
+            ) from error
         raise InputError(
             f"{path}: cannot be read as NIfTI-1, NRRD, MHA or DICOM series ({reason[:200]}). Save it in one of these "
             "formats."
@@ -47,7 +51,7 @@ def _read_file(path: Path) -> sitk.Image:
     reader.SetImageIO(_reader_of(path))
     reader.SetFileName(str(path))
     reader.ReadImageInformation()
-    detached = path.name.lower().endswith(_DETACHED)
+    detached = path.name.lower().endswith(DETACHED)
     check_claim(path, reader.GetSize(), reader.GetNumberOfComponents(), None if detached else path.stat().st_size)
     return reader.Execute()
 

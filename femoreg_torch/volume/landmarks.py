@@ -88,6 +88,8 @@ def _fcsv_points(path: Path) -> list[tuple[Any, Any, Any]]:
 
 def _point(value: Any, where: str) -> Tensor:
     try:
+        if not isinstance(value, list):
+            raise TypeError
         point = torch.tensor([float(v) for v in value], dtype=torch.float64)
     except (TypeError, ValueError, OverflowError):
         point = torch.empty(0)

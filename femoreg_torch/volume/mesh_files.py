@@ -92,6 +92,7 @@ def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, tri
     try:
         with quiet():
             _check_unzipped(path)
+            _check_whole(path)
             bodies = _bodies(trimesh.load_scene(path, process=False, **options), path)
     except InputError:
         raise
@@ -101,6 +102,20 @@ def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, tri
     if not bodies:
         raise InputError(f"{path}: the mesh holds no triangle.")
     return bodies
+
+
+def _check_whole(path: Path) -> None:
+    """Raises `InputError` for a binary STL file whose size is not that of the triangles that it counts."""
+    if path.suffix.lower() != ".stl":
+        return
+    with opened(path) as file:
+        head = file.read(84)
+    size = path.stat().st_size
+    if len(head) == 84 and b"\0" in head and size != 84 + 50 * (count := int.from_bytes(head[80:], "little")):
+        raise InputError(
+            f"{path}: counts {count} triangles, which take {84 + 50 * count} bytes, and has {size}: it is cut off or "
+            "damaged. Export it anew."
+        )
 
 
 def _check_unzipped(path: Path) -> None:

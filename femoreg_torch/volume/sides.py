@@ -10,6 +10,7 @@ from femoreg_torch.volume.bones import BoneLabels, nearest_label, nearest_voxel
 from femoreg_torch.volume.labels import label_box_centre
 
 _CLOSER_MM, _FAR_MM = 2.0, 30.0
+_ON_MM, _OFF_MM = 2.0, 6.0  # so near to a bone a landmark lies on it, and so far away it does not
 _RAS = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
 
 
@@ -61,6 +62,35 @@ def stray_landmarks(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy:
             "says LPS, or the other way round. Correct its coordinate system"
         ]
     return [f"landmarks: {', '.join(stray)} lie far from the bones that they are named after. Place them anew"]
+
+
+def merged_bones(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy | None) -> list[str]:
+    """In words, bones that the label map has as part of another one; empty if there are none.
+
+    Most of the `landmarks` (3,), LPS mm, of such a bone lie on that one, and none of its own voxels is near.
+    """
+    if anatomy is None:
+        return []
+    told = []
+    for bone in (bone for bone in anatomy.bones if bone.name in bones.ids or bone.name in bones.absent):
+        given = [mark for mark in anatomy.landmarks_of(bone.name) if mark in landmarks]
+        others = {n: name for name, n in bones.ids.items() if name != bone.name}
+        own = [bones.ids[bone.name]] if bone.name in bones.ids else []
+        on: dict[str, list[str]] = {}
+        for mark in given:
+            found = nearest_voxel(bones.labels, list(others), landmarks[mark]) if others else None
+            if found is None or found[1] > _ON_MM:
+                continue
+            near = nearest_voxel(bones.labels, own, landmarks[mark]) if own else None
+            if near is None or near[1] > _OFF_MM:
+                on.setdefault(others[found[0]], []).append(mark)
+        for other, marks in on.items():
+            if 2 * len(marks) > len(given):
+                told.append(
+                    f"label map: {', '.join(marks)} of the {bone.name} lie on the {other}: does the label map hold "
+                    "both as one, or parts of one under the other's id? Part them"
+                )
+    return told
 
 
 def _mixed_up(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy) -> bool:

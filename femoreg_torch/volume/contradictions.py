@@ -1,0 +1,104 @@
+"""Do the grey values of a CT and a label map belong to one another?"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy import fft
+from torch import Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.volume.grid import Volume
+from femoreg_torch.volume.labels import label_box
+
+_MEDIANS_MM, _SHIFTS_MM = 3.0, 2.0  # apart are the voxels that are looked at, or as far as the CT's own
+# Median HU. Of right CTs, sparse bone and bones without soft tissue too: labels 30 to 700, what lies 6 to 9 mm
+# beside them −1000 to 110. With the intercept of −1024 applied twice, labels −770; never applied, beside them 1070.
+_LEAST_BONE_HU, _MOST_SOFT_HU = -150.0, 350.0
+_MOST_VALUES = 20_000  # a median needs no more
+_REACH_MM = 15.0  # how far a label map is looked for
+_BRIGHT_HU = 150.0, 550.0  # from here on a voxel is bone, from there on it is no more so
+_LEAST_SHIFT_MM = 2.5
+_LEAST_GAIN = 0.15
+
+
+def wrong_hounsfield(ct: Volume, labels: Volume) -> str | None:
+    """In words, that a CT is not in HU, as its bones and what lies beside them say; None where they do not say so."""
+    steps = _steps(ct, _MEDIANS_MM)
+    data, inside = ct.data[steps], labels.data[steps] > 0
+    if not inside.any():
+        return None
+    near, far = (_grown(inside, by) for by in (1, 3))
+    bone, soft = _median(data[inside]), _median(data[far & ~near])
+    if bone < _LEAST_BONE_HU:
+        return (
+            f"CT: in the median the bones of the label map have {bone:.0f} HU: is the intercept of the scanner's "
+            "rescale applied twice, or do CT and label map not belong to one another? Export the CT in HU"
+        )
+    if soft > _MOST_SOFT_HU:
+        return (
+            f"CT: in the median what lies beside the bones has {soft:.0f} HU, and soft tissue has 50: is the rescale "
+            "of the scanner applied? Export the CT in HU"
+        )
+    return None
+
+
+def misplaced_labels(ct: Volume, labels: Volume, ids: Sequence[int]) -> str | None:
+    """In words, that the bones of these ids would lie on the bright ones of a CT if they were shifted, or None.
+
+    What is compared is how bright the labels' voxels are beyond what lies beside them, at all shifts of up to 15 mm.
+    """
+    low, high = label_box(labels, ids)
+    margin = [math.ceil(_REACH_MM / s) + 2 for s in labels.spacing_mm]
+    shape = labels.data.shape[::-1]
+    box = tuple(slice(max(a - m, 0), min(b + m, n)) for a, b, m, n in zip(low, high, margin, shape, strict=True))[::-1]
+    steps = _steps(ct, _SHIFTS_MM)
+    data, inside = ct.data[box][steps], labels.data[box][steps] > 0
+    bright = (data.float().clamp(*_BRIGHT_HU) - _BRIGHT_HU[0]).numpy()
+    beside = _grown(inside, 1) & ~inside
+    kernel = inside.float() - beside.float() * (inside.sum() / beside.sum().clamp_min(1))
+    reach = [math.ceil(_REACH_MM / (s * step.step)) for s, step in zip(ct.spacing_mm[::-1], steps, strict=True)]
+    scores = _correlation(bright, kernel.numpy(), reach)
+    here = scores[tuple(reach)]
+    best = np.unravel_index(int(scores.argmax()), scores.shape)
+    voxels = [(b - r) * step.step for b, r, step in zip(best, reach, steps, strict=True)][::-1]
+    shift = ct.lps_from_index[:3, :3] @ torch.tensor(voxels, dtype=torch.float64)
+    if float(shift.norm()) < _LEAST_SHIFT_MM or scores[best] < (1 + _LEAST_GAIN) * max(here, 0):
+        return None
+    told = ", ".join(f"{mm + 0.0:.0f}" for mm in shift.tolist())
+    return (
+        f"label map: would lie on the bright bones of the CT if it were moved by ({told}) mm LPS: does it belong to "
+        "this CT, and do both headers say where the first voxel lies?"
+    )
+
+
+def _steps(volume: Volume, apart_mm: float) -> tuple[slice, slice, slice]:
+    """Every n-th voxel along z, y and x, so that they are about as far apart."""
+    x, y, z = (slice(None, None, max(1, round(apart_mm / s))) for s in volume.spacing_mm)
+    return z, y, x
+
+
+def _median(values: Tensor) -> float:
+    """Of some of the values (N,); nan of none."""
+    return float(values[:: 1 + len(values) // _MOST_VALUES].float().median()) if len(values) else math.nan
+
+
+def _grown(mask: Tensor, by: int) -> Tensor:
+    """A mask (D, H, W), bool, grown by some voxels along all axes."""
+    grown = mask.float()[None, None]
+    for axis in range(3):
+        size, padding = [1, 1, 1], [0, 0, 0]
+        size[axis], padding[axis] = 2 * by + 1, by
+        grown = F.max_pool3d(grown, size, 1, padding)
+    return grown[0, 0] > 0
+
+
+def _correlation(image: np.ndarray, kernel: np.ndarray, reach: Sequence[int]) -> np.ndarray:
+    """Σ image(x + shift) kernel(x), for all shifts of up to `reach` voxels along each axis, (2 r + 1, …)."""
+    shape = [fft.next_fast_len(n + r, real=True) for n, r in zip(image.shape, reach, strict=True)]
+    product = fft.rfftn(image, shape) * np.conj(fft.rfftn(kernel, shape))
+    found = fft.irfftn(product, shape)
+    for axis, r in enumerate(reach):
+        found = np.take(found, range(-r, r + 1), axis, mode="wrap")
+    return np.asarray(found)
