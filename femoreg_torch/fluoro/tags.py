@@ -66,7 +66,7 @@ def read_tags(dataset: Any) -> Tags:
     shape = (int(rows), int(columns)) if rows and columns else None
     pixel = _numbers(dataset, "ImagerPixelSpacing", 2)
     sdd = _numbers(dataset, "DistanceSourceToDetector", 1)
-    if sdd == (0.0,):
+    if sdd == [0.0]:
         sdd = None  # as some write what they do not know
     for name, value in (("ImagerPixelSpacing", pixel), ("DistanceSourceToDetector", sdd)):
         if value is not None and min(value) <= 0:

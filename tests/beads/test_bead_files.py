@@ -1,6 +1,7 @@
 """`beads.yaml` and tables of shadows: what is read, and what is told of bad ones."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,3 +108,12 @@ def test_bad_annotations_are_told_with_their_line(case: Case, rows: str, told: s
 def test_a_missing_file_is_told(case: Case) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_beads(case.folder / "none.yaml", case)
+
+
+def test_images_of_one_name_are_refused_as_marks_go_by_it(case: Case) -> None:
+    view = case.views[0]
+    folders = [case.folder / name for name in ("a", "b")]
+    twice = replace(case, views=tuple(replace(view, images={"anatomy": at / "img.tif"}) for at in folders))
+    (case.folder / "px.csv").write_text("image,bead,column_px,row_px\nimg.tif,,1,2\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"two images of the case are called 'img\.tif'"):
+        read_beads(written(case, BOTH + "annotations: px.csv\n"), twice)

@@ -36,6 +36,8 @@ def test_markups_of_the_image_plane(tmp_path: Path) -> None:
         (HEADER + "view1.tif,FH-l,one,2,1,1\n", "line 2: two finite numbers"),
         (HEADER + "view1.tif,FH-l,nan,2,1,1\n", "line 2: two finite numbers"),
         (HEADER + "view1.tif,FH-l,1,2,1,0\n", "no row is visible"),
+        (HEADER + "view1.tif,FH-l,1,2,1,FALSE\nview1.tif,FH-r,1,2,1,no\n", "no row is visible"),
+        (HEADER + "view1.tif,FH-l,1,2,1,perhaps\n", "line 2: visible: 1 or 0 was expected, found 'perhaps'"),
     ],
 )
 def test_bad_tables(tmp_path: Path, text: str, says: str) -> None:

@@ -23,6 +23,7 @@ from femoreg_torch.fluoro import (
     Tags,
     carm_settings,
     contradictions,
+    read_header,
     read_stored,
 )
 from femoreg_torch.fluoro import settled_intensity as settled
@@ -366,3 +367,16 @@ def test_a_field_that_is_not_in_the_middle_moves_the_principal_point(tmp_path: P
 def test_a_header_with_gaps_tells_no_carm(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"does not say `sdd_mm` \(DistanceSourceToDetector\)"):
         carm_settings(write(tmp_path, ImagerPixelSpacing=[0.2, 0.2]))
+
+
+def test_a_distance_of_0_is_one_that_is_not_known(tmp_path: Path) -> None:
+    assert read_header(write(tmp_path, DistanceSourceToDetector=0)).sdd_mm is None
+
+
+def test_a_header_that_cannot_be_parsed_is_told_with_its_file(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    content = path.read_bytes()
+    rows = content.index(b"\x28\x00\x10\x00US\x02\x00")  # 2 bytes of (0028,0010); 3 are no number
+    path.write_bytes(content[: rows + 6] + b"\x03\x00" + content[rows + 8 : rows + 10] + b"\0" + content[rows + 10 :])
+    with pytest.raises(InputError, match="its DICOM header cannot be read"):
+        read_header(path)

@@ -7,6 +7,7 @@ import numpy as np
 import pydicom
 import pytest
 import SimpleITK as sitk
+import tifffile
 import torch
 from fuzz_faults import full_after
 from pydicom.dataset import FileDataset, FileMetaDataset
@@ -190,3 +191,18 @@ def test_only_16_bit_grey_images_are_written(tmp_path: Path, image: torch.Tensor
 def test_an_image_is_not_written_into_a_folder_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no folder"):
         write_image(tmp_path / "no" / "view.png", torch.from_numpy(PIXELS))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_tiff_that_says_that_0_is_white_is_turned_over(tmp_path: Path, dtype: type) -> None:
+    pixels = (PIXELS // (1 if dtype is np.uint16 else 16)).astype(dtype)
+    for kind in ("minisblack", "miniswhite"):
+        tifffile.imwrite(tmp_path / f"{kind}.tif", pixels, photometric=kind)
+    np.testing.assert_array_equal(read_image(tmp_path / "minisblack.tif").numpy(), pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / "miniswhite.tif").numpy(), np.iinfo(dtype).max - pixels)
+
+
+def test_a_tiff_of_fractions_that_says_that_0_is_white_is_refused(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "view.tif", PIXELS.astype(np.float32), photometric="miniswhite")
+    with pytest.raises(InputError, match=r"view\.tif: says that 0 is white"):
+        read_image(tmp_path / "view.tif")

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import attenuation_image, binned, downsample
+from femoreg_torch.fluoro import attenuation_image, below_zero, binned, downsample, intensity_of
 from femoreg_torch.geometry import centred_camera, project_points
 
 
@@ -76,3 +76,23 @@ def test_a_blob_stays_where_the_coarser_camera_sees_it() -> None:
     rows, columns = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
     found = torch.stack([(coarse * columns).sum(), (coarse * rows).sum()]) / coarse.sum()
     torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1000 / math.log(10), 40.0])
+def test_logarithms_of_any_scale_give_intensities_in_their_order(scale: float) -> None:
+    """Those of another base than e give other intensities, as dark as a patient's."""
+    depth = torch.linspace(-0.2, 6, 400).view(20, 20)
+    found = intensity_of(scale * depth + 3)
+    assert (found.flatten().diff() < 0).all()
+    assert 1e-5 < float(found.min()) < 5e-3
+    if scale == 1:
+        torch.testing.assert_close(found, torch.exp(-(depth + 0.2)))
+
+
+def test_many_pixels_below_zero_are_told_and_padding_is_none() -> None:
+    raw = torch.ones(10, 10)
+    raw[0] = -5
+    assert "has 10 % of its pixels below 0" in str(below_zero(raw))
+    assert below_zero(raw, raw < 0) is None
+    raw[0, 1:] = 0  # a shutter
+    assert below_zero(raw) is None

@@ -155,6 +155,9 @@ def test_runs_in_time_and_headers_without_a_space(tmp_path: Path) -> None:
     said = axes.replace("space dimension: 3", "space: left-posterior-superior")
     (tmp_path / "said.nrrd").write_bytes((bare + said + "\n").encode() + content)
     assert not any("space" in one for one in inspect_path(tmp_path / "said.nrrd").warnings)
+    loud = axes.replace("space dimension: 3", "Space: Scanner-XYZ")
+    (tmp_path / "loud.nrrd").write_bytes((bare + loud + "\n").encode() + content)
+    assert any("`space` Scanner-XYZ, which says" in one for one in inspect_path(tmp_path / "loud.nrrd").warnings)
 
 
 def test_label_maps_of_floats_and_with_names_in_the_header(tmp_path: Path, plain: Volume) -> None:

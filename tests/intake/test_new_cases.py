@@ -10,13 +10,13 @@ import pytest
 import SimpleITK as sitk
 import torch
 import yaml
-from intake_files import ENTRY, HEAD, bones, landmarks, markups, ras_affine, write_files
+from intake_files import ENTRY, HEAD, SPACING, bones, landmarks, markups, ras_affine, write_files
 from pydicom.dataset import FileMetaDataset
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, XRayAngiographicImageStorage, generate_uid
 
 from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
-from femoreg_torch.fluoro import Display
+from femoreg_torch.fluoro import Display, read_image
 from femoreg_torch.intake import inspect_path
 from femoreg_torch.intake.volumes import fitting_tables
 from femoreg_torch.volume import read_ct, read_labels
@@ -177,6 +177,24 @@ def test_other_forms_give_the_same_bones(files: Path, tmp_path: Path, changes: d
             assert np.array_equal((labels == number).numpy(), sitk_mask(files, name))
     content = yaml.safe_load((tmp_path / "case" / "case.yaml").read_text(encoding="utf-8"))
     assert ("device" in content) == (changes.get("device", "") is not None)
+
+
+def test_images_whose_values_stand_beside_their_headers_are_copied_whole(files: Path, tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(100, 60000, (48, 40)).astype(np.uint16)
+    images = []
+    for n in (1, 2):
+        images.append(tmp_path / f"shot{n}.mhd")
+        sitk.WriteImage(sitk.GetImageFromArray(pixels + n), str(images[-1]))
+    given = {
+        "carm": files / "carm.yaml",
+        "images": images,
+        "device": None,
+        "device_images": None,
+        "device_points": None,
+    }
+    assert main(arguments(files, tmp_path / "case", **given)) == 0
+    found = read_image(read_case(tmp_path / "case").views[1].images["anatomy"])
+    np.testing.assert_array_equal(found.numpy(), pixels + 2)
 
 
 @pytest.mark.parametrize(
@@ -340,6 +358,8 @@ def test_inspect_warns_of_swapped_landmarks_and_unclear_headers(files: Path, tmp
     image.header.set_qform(None, 0)
     nibabel.Nifti1Image(np.asarray(image.dataobj), None, image.header).to_filename(tmp_path / "bare.nii.gz")
     assert any("neither sform nor qform" in one for one in inspect_path(tmp_path / "bare.nii.gz").warnings)
+    affine = read_ct(tmp_path / "bare.nii.gz").lps_from_index  # as the warning says: to the left, back and head
+    torch.testing.assert_close(affine[:3, :3], SPACING * torch.eye(3, dtype=torch.float64))
     moved = ras_affine()
     moved[0, 3] += 5
     image = nibabel.Nifti1Image(np.asarray(image.dataobj), ras_affine())

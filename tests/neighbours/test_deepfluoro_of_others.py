@@ -1,5 +1,6 @@
 """Small files of the documented layouts of DeepFluoro and xReg are read as they are."""
 
+import shutil
 from pathlib import Path
 
 import h5py
@@ -153,6 +154,26 @@ def test_itk_transforms_come_back(tmp_path: Path, name: str) -> None:
     pose = torch.from_numpy(lps_from_world())
     write_transform(tmp_path / name, pose)
     torch.testing.assert_close(read_transform(tmp_path / name), pose, atol=1e-9, rtol=0)
+    with pytest.raises((InputError, OSError)):
+        write_transform(tmp_path / "none" / name, pose)
+
+
+@pytest.mark.parametrize(("part", "value", "told"), [
+    ("vol/spacing", np.array([[1.0], [0.0], [2.0]]), "spacing is not above 0"),
+    ("vol/dir-mat", np.array([[1.0, 0.2, 0], [0, 1, 0], [0, 0, 1]]), "not at right angles"),
+    ("vol-seg/image/pixels", np.full((8, 6, 5), 1.9), "labels are whole numbers from 0 to 255"),
+    ("vol-seg/image/pixels", np.full((8, 6, 5), -1), "labels are whole numbers from 0 to 255"),
+    ("vol-seg/image/pixels", np.ones((8, 6, 4), np.uint8), "another size than its CT"),
+])  # fmt: skip
+def test_a_specimen_that_cannot_be_is_refused(
+    tmp_path: Path, full: Path, part: str, value: np.ndarray, told: str
+) -> None:
+    shutil.copy(full, tmp_path / "bad.h5")
+    with h5py.File(tmp_path / "bad.h5", "a") as file:
+        del file[f"17-1882/{part}"]
+        file[f"17-1882/{part}"] = value
+    with pytest.raises(InputError, match=told):
+        read_specimen(tmp_path / "bad.h5", "17-1882")
 
 
 def test_what_is_missing_is_named(tmp_path: Path, full: Path) -> None:

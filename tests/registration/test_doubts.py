@@ -8,8 +8,9 @@ import torch
 from registration_scenes import CARM, float64, make_scene, true_poses
 
 from femoreg_torch.case import Case, CaseObject, PlannedPath
-from femoreg_torch.geometry import about_point, exp_se3
-from femoreg_torch.registration.doubts import doubts_about_the_plan, doubts_about_the_views
+from femoreg_torch.case.model import Model
+from femoreg_torch.geometry import Poses, about_point, exp_se3
+from femoreg_torch.registration.doubts import doubts_about_the_guide, doubts_about_the_plan, doubts_about_the_views
 from femoreg_torch.registration.scene import Scene
 
 TRUTH = true_poses()
@@ -74,3 +75,18 @@ def test_a_path_that_leaves_the_bone_is_doubted(scene: Scene) -> None:
     (doubt,) = doubts_about_the_plan(planned(low, high), replace(scene, objects=scene.objects | {"pelvis": hollow}))
     assert "leaves" in doubt
     assert torch.isfinite(torch.tensor(low)).all()
+
+
+@pytest.mark.parametrize(("tip", "base", "told"), [(100.0, 0.0, 0), (0.0, 100.0, 1)])
+def test_a_guide_that_points_out_of_the_bone_is_doubted(tip: float, base: float, told: int) -> None:
+    """Tip and base of the device exchanged: its pose is right, and the tip is told a device's length away."""
+    path = PlannedPath("pelvis", float64(0, 0, 0), float64(10, 0, 80), "drill")
+    points = {"tip": float64(0, 0, tip), "base": float64(0, 0, base)}
+    drill = CaseObject("drill", model=Model(Path("drill.stl"), 5000.0), points=points)
+    case = Case(Path(), CARM, {"pelvis": CaseObject("pelvis", ("pelvis",)), "drill": drill}, plan=path)
+    pose = torch.eye(4, dtype=torch.float64)
+    poses = Poses(pose[None], {"pelvis": pose, "drill": pose})
+    doubts = doubts_about_the_guide(case, poses)
+    assert len(doubts) == told
+    assert all("`tip` and `base` exchanged" in doubt for doubt in doubts)
+    assert doubts_about_the_guide(case, Poses(pose[None], {"pelvis": pose})) == ()

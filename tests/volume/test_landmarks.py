@@ -135,6 +135,8 @@ BAD = {
     "nan": ('{"space": "LPS", "unit": "mm", "landmarks": {"FH-l": [NaN, 0, 0]}}', "FH-l: three finite numbers"),
     "two numbers": (json.dumps(plain(landmarks={"FH-l": [1, 2]})), "FH-l: three finite numbers"),
     "words": (json.dumps(plain(landmarks={"FH-l": ["a", 0, 0]})), "FH-l: three finite numbers"),
+    "digits": (json.dumps(plain(landmarks={"FH-l": "123"})), "FH-l: three finite numbers"),
+    "an object": (json.dumps(plain(landmarks={"FH-l": {"1": 1, "2": 2, "3": 3}})), "FH-l: three finite numbers"),
     "null": (json.dumps(plain(landmarks={"FH-l": None})), "FH-l: three finite numbers"),
     "no json": ("FH-l 1 2 3", "cannot be read as JSON"),
     "no object": ("[1, 2]", "a JSON object"),

@@ -102,3 +102,12 @@ def test_step_says_what_to_export(tmp_path: Path) -> None:
     (tmp_path / "device.STEP").write_text("ISO-10303-21;", encoding="utf-8")
     with pytest.raises(InputError, match=r"device\.STEP: is a STEP file\. Export it as STL, or as 3MF"):
         read_mesh(tmp_path / "device.STEP")
+
+
+@pytest.mark.parametrize("change", [-25, 7])
+def test_a_binary_stl_that_is_cut_off_or_too_long_is_told(tmp_path: Path, change: int) -> None:
+    trimesh.creation.box((10, 10, 60)).export(tmp_path / "device.stl")
+    content = (tmp_path / "device.stl").read_bytes()
+    (tmp_path / "device.stl").write_bytes(content[:change] if change < 0 else content + b"\0" * change)
+    with pytest.raises(InputError, match=r"counts 12 triangles, which take 684 bytes, and has"):
+        read_mesh(tmp_path / "device.stl")

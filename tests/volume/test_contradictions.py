@@ -1,0 +1,54 @@
+"""Grey values and label maps that do not belong to one another, of bones that are balls and shells in soft tissue."""
+
+import pytest
+import torch
+
+from femoreg_torch.volume import Volume, axis_aligned, misplaced_labels, wrong_hounsfield
+
+IDS = (1, 2)
+
+
+def ct_and_labels(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> tuple[Volume, Volume]:
+    """Two balls of bone, marrow within, an unlabelled third one beside them, air all around."""
+    counts = [round(140 / s) for s in spacing]
+    x, y, z = torch.meshgrid(*(torch.arange(n) * s for n, s in zip(counts, spacing, strict=True)), indexing="ij")
+    x, y, z = (axis.permute(2, 1, 0) for axis in (x, y, z))
+    hu = torch.where((x - 70) ** 2 + (y - 70) ** 2 < 65**2, 40.0, -1000.0)
+    labels = torch.zeros(hu.shape, dtype=torch.uint8)
+    for label, (cx, cy, cz, radius) in {1: (45, 70, 60, 22), 2: (100, 60, 70, 18), 0: (80, 105, 60, 15)}.items():
+        away = ((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2).sqrt()
+        hu = torch.where(away < radius, torch.where(away < radius - 4, 120.0, 800.0), hu)
+        labels[away < radius] = label
+    affine = axis_aligned(spacing, (-70.0, -70.0, 900.0))
+    hu += 25 * torch.randn(hu.shape, generator=torch.Generator().manual_seed(0))
+    return Volume(hu, affine), Volume(labels, affine)
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 3.0), (3.0, 3.0, 3.0)])
+def test_what_belongs_together_is_not_doubted(spacing: tuple[float, float, float]) -> None:
+    ct, labels = ct_and_labels(spacing)
+    assert wrong_hounsfield(ct, labels) is None
+    assert misplaced_labels(ct, labels, IDS) is None
+    bare = ct.with_data(torch.where(labels.data > 0, ct.data, torch.tensor(-1000.0)))  # bones in air, as of a dry femur
+    assert wrong_hounsfield(bare, labels) is None
+    assert misplaced_labels(bare, labels, IDS) is None
+
+
+@pytest.mark.parametrize(("offset", "told"), [(-1024.0, "applied twice"), (1024.0, "is the rescale of the scanner")])
+def test_an_intercept_that_is_missing_or_there_twice_is_told(offset: float, told: str) -> None:
+    ct, labels = ct_and_labels()
+    assert told in str(wrong_hounsfield(ct.with_data(ct.data + offset), labels))
+
+
+@pytest.mark.parametrize("shift", [(4, 0, 0), (0, -8, 0), (3, 3, -11)])
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 3.0)])
+def test_labels_beside_their_bones_are_told(shift: tuple[int, int, int], spacing: tuple[float, float, float]) -> None:
+    """Rolled by whole voxels, so that the label map lies that far to the left, back and head."""
+    ct, labels = ct_and_labels(spacing)
+    voxels = [round(mm / s) for mm, s in zip(shift, spacing, strict=True)]
+    moved = labels.with_data(labels.data.roll(voxels[::-1], (0, 1, 2)))
+    told = str(misplaced_labels(ct, moved, IDS))
+    assert "if it were moved by" in told
+    found = [float(part) for part in told.partition("moved by (")[2].partition(")")[0].split(", ")]
+    asked = [-n * s for n, s in zip(voxels, spacing, strict=True)]
+    assert found == pytest.approx(asked, abs=max(2.0, spacing[2] / 2) + 0.5)
