@@ -47,7 +47,9 @@ def write_measured(out: Path, case: Case, found: Measured) -> None:
     with new_folder(out) as folder:
         views = tuple(_clean_view(folder, out, case, found, number) for number in range(len(case.views)))
         ct_path = _clean_ct(folder, out, case, found)
-        cleaned = replace(case, folder=out, views=views, ct_path=ct_path, truth=found.bundle.poses)
+        cleaned = replace(
+            case, folder=out, views=views, ct_path=ct_path, truth=found.bundle.poses, truth_source="beads"
+        )
         write_case(folder, cleaned, standing=out)
         write_json(folder / UNCERTAINTY_NAME, uncertainty_content(case, found))
         _write_table(folder / BEADS_NAME, found)

@@ -101,6 +101,7 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
     device = read_device(top.mapping("device"), folder, path, side) if "device" in top else None
     objects = femoroplasty_objects(side, landmarks[head], device)
     display = read_display(top)
+    truth, truth_source = read_truth(top, folder, list(objects), len(views))
     return Case(
         folder=folder,
         carm=read_carm(top, display, views),
@@ -112,7 +113,8 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
         bones=bones,
         landmarks=landmarks,
         plan=planned(side, entry_point, target, device, file),
-        truth=read_truth(top, folder, list(objects), len(views)),
+        truth=truth,
+        truth_source=truth_source,
         template=TEMPLATE,
         side=side,
         display=display,

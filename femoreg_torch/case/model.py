@@ -137,6 +137,10 @@ class View:
     grid: GridImage | None = None  # of an image intensifier, at this pose of the C-arm
 
 
+TruthSource = Literal["simulation", "beads"]
+TRUTH_SOURCES: tuple[TruthSource, ...] = ("simulation", "beads")
+
+
 @dataclass(frozen=True, eq=False)
 class Case:
     """One procedure. Points are mm, all tensors float64."""
@@ -152,6 +156,7 @@ class Case:
     landmarks: dict[str, Tensor] = dataclasses.field(default_factory=dict)  # (3,) each, LPS
     plan: PlannedPath | None = None
     truth: Poses | None = None
+    truth_source: TruthSource | None = None  # where it comes from, if its file says so
     template: str | None = None  # what `case.yaml` is a short form of
     side: Side | None = None  # operated side, where the template has one
     display: Display = dataclasses.field(default_factory=Display)  # of the images as they are stored

@@ -11,7 +11,7 @@ from torch import Tensor
 from femoreg_torch.anatomy import Anatomy, LabelTable, bone_of_name, label_table, load_anatomy
 from femoreg_torch.anatomy.tables import label_ids
 from femoreg_torch.case.fields import Fields
-from femoreg_torch.case.model import Intensity, View
+from femoreg_torch.case.model import TRUTH_SOURCES, Intensity, TruthSource, View
 from femoreg_torch.case.poses import poses_from
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json
@@ -255,23 +255,25 @@ def with_known_poses(views: tuple[View, ...], top: Fields) -> tuple[View, ...]:
     return views
 
 
-def read_truth(top: Fields, folder: Path, objects: list[str], views: int) -> Poses | None:
-    """Known poses, or None: of all objects, or, where the first one's are not known, of some.
+def read_truth(top: Fields, folder: Path, objects: list[str], views: int) -> tuple[Poses | None, TruthSource | None]:
+    """Known poses, or None, and where they come from, if their file says so.
 
-    In the second case another object tells the C-arm's poses, in all views or in the first alone.
+    They are of all objects, or, where the first one's are not known, of some. In the second case another object tells
+    the C-arm's poses, in all views or in the first alone.
     """
     if "truth" not in top:
-        return None
+        return None, None
     path = top.file_path("truth", folder)
     fields = Fields(read_json(path), str(path))
     told = [name for name in objects if f"camera_from_{name}" in fields] or objects[:1]
     leader = told[0]
     others = [name for name in objects if name != leader]
-    fields.only(f"camera_from_{leader}", *(f"camera1_from_{name}" for name in others if name != objects[0]))
+    source = cast(TruthSource, fields.choice("source", TRUTH_SOURCES)) if "source" in fields else None
+    fields.only("source", f"camera_from_{leader}", *(f"camera1_from_{name}" for name in others if name != objects[0]))
     if leader != objects[0]:
         others = [name for name in others if f"camera1_from_{name}" in fields]
     truth = poses_from(fields, leader, others)
     count = len(truth.camera_from_camera1)
     if views and count != views and (leader == objects[0] or count != 1):
         raise InputError(f"{fields.where(f'camera_from_{leader}')}: {count} poses, but the case has {views} views.")
-    return truth
+    return truth, source

@@ -73,6 +73,7 @@ def _read_objects(top: Fields, folder: Path) -> Case:
             raise InputError(f"{entries.where(name)}.start.beside: the name of another object was expected: {others}.")
     views = tuple(read_view(view, folder) for view in top.mappings("views")) if "views" in top else ()
     display = read_display(top)
+    truth, truth_source = read_truth(top, folder, list(objects), len(views))
     return Case(
         folder=folder,
         carm=read_carm(top, display, views),
@@ -84,7 +85,8 @@ def _read_objects(top: Fields, folder: Path) -> Case:
         bones=bones,
         landmarks=landmarks,
         plan=read_plan(top.mapping("plan"), folder, objects, landmarks) if "plan" in top else None,
-        truth=read_truth(top, folder, list(objects), len(views)),
+        truth=truth,
+        truth_source=truth_source,
         display=display,
     )
 

@@ -51,7 +51,8 @@ def write_case(folder: Path, case: Case, standing: Path | None = None) -> None:
         content["views"] = [_view(view, base, case.template is not None) for view in case.views]
     if case.truth is not None:
         told_by = case.anchor if case.anchor in case.truth.camera1_from else next(iter(case.truth.camera1_from))
-        write_json(folder / "truth.json", poses_content(case.truth, told_by))
+        source = {} if case.truth_source is None else {"source": case.truth_source}
+        write_json(folder / "truth.json", source | poses_content(case.truth, told_by))
         content["truth"] = "truth.json"
     text = yaml.safe_dump(plain(content), sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
     write_text(folder / "case.yaml", text)

@@ -1,7 +1,12 @@
 """Whether a result is of a case."""
 
+import torch
+
 from femoreg_torch.case import Case, Result
+from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.errors import InputError, shortened
+
+_ROUNDED = 1e-3  # mm, or of a direction: what a file's digits leave
 
 
 def check_fits(case: Case, result: Result) -> None:
@@ -17,3 +22,15 @@ def check_fits(case: Case, result: Result) -> None:
         raise InputError(
             f"the result has {views} views, but {case.folder} has {len(case.views)}. Name the case that was registered."
         )
+
+
+def check_plan_fits(case: Case, result: Result) -> None:
+    """Raises `InputError` if the path or the guide that a result tells is not the one of the case."""
+    points, directions = path_in_camera1(case, result.poses)
+    for told, here in ((result.points_camera1, points), (result.directions_camera1, directions)):
+        for name in told.keys() & here.keys():
+            if not torch.allclose(told[name], here[name], atol=_ROUNDED):
+                raise InputError(
+                    f"{case.folder}: its {name.replace('_', ' ')} is another one than the result tells: the plan or "
+                    "the device's points were changed since. Register again."
+                )

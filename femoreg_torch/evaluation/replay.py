@@ -183,8 +183,7 @@ def draw_frames(
             rows.append(np.hstack(panels))
         width = rows[0].shape[1]
         end = index == len(frames) - 1
-        simulated = case.truth is not None and case.anchor in case.truth.camera1_from  # a measured truth lacks it
-        note = "simulated images; " if simulated else ""
+        note = "simulated images; " if case.truth_source == "simulation" else ""
         foot = [(f"{note}research software, not a medical device", _GREY), verdict if end else ("", _GREY)]
         yield np.vstack([_bar(width, (frame.stage, _WHITE), (frame.detail, _WHITE)), *rows, _bar(width, *foot)])
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from femoreg_torch.case import Case, Result, new_folder
 from femoreg_torch.evaluation.errors import errors, reference_points
-from femoreg_torch.evaluation.fit import check_fits
+from femoreg_torch.evaluation.fit import check_fits, check_plan_fits
 from femoreg_torch.evaluation.overlay import draw, overlay_figure
 from femoreg_torch.files import write_json, write_text
 from femoreg_torch.pictures import write_picture
@@ -34,6 +34,7 @@ def write_report(case: Case, result: Result, run: Path) -> dict[str, Any] | None
     from femoreg_torch.evaluation.report.pictures import PANEL_PX
 
     check_fits(case, result)
+    check_plan_fits(case, result)
     scene = prepare_scene(case)
     found = evaluate(case, result, scene)
     drawn = draw(scene, result.poses, PANEL_PX)
@@ -53,5 +54,6 @@ def evaluation_page(case: Case, result: Result, scene: Scene) -> str:
     from femoreg_torch.evaluation.report.pictures import PANEL_PX
 
     check_fits(case, result)
+    check_plan_fits(case, result)
     found = evaluate(case, result, scene)
     return report_page(case, scene, result, found, draw(scene, result.poses, PANEL_PX))

@@ -17,7 +17,7 @@ from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
 from femoreg_torch.intake.planes import Picture
 from femoreg_torch.registration import Scene, prepare_scene
-from femoreg_torch.registration.doubts import doubts_about_the_guide
+from femoreg_torch.registration.doubts import doubts_about_the_guide, doubts_about_the_plan
 from femoreg_torch.registration.run import network_detector
 from femoreg_torch.registration.start import look_at, start_by_detection, start_by_landmarks
 
@@ -54,6 +54,7 @@ def picture_of_start(case: Case, landmarks: Mapping[str, Tensor] | None = None) 
     warnings = (
         *hardly_shown(scene, poses, models),
         *path_out_of_view(case.plan, scene, poses),
+        *doubts_about_the_plan(case, scene),
         *doubts_about_the_guide(case, poses),
     )
     return StartPicture(np.hstack(panels), tuple(facts), warnings)

@@ -148,7 +148,7 @@ def write_images_and_case(folder: Path, known: Preoperative, images: list[ViewIm
         write_image(paths[DEVICE_IMAGES], view.device)
         views.append(View(paths))
     write_preview(folder / "preview.png", images, known.case.carm.camera)
-    write_case(folder, replace(known.case, views=tuple(views), truth=procedure.truth))
+    write_case(folder, replace(known.case, views=tuple(views), truth=procedure.truth, truth_source="simulation"))
 
 
 def check_same_patient(labels: Volume, finer: Volume, femur: tuple[int, ...]) -> None:

@@ -60,6 +60,7 @@ def case(tmp_path: Path) -> Path:
     write_grid(folder / "ct.nii.gz", ct)
     write_grid(folder / "labels.nii.gz", labels)
     points = {name: [float(10 * i - 60), 0.0, float(5 * i - 40)] for i, name in enumerate(HIP.landmark_names)}
+    points |= {"FH-l": [70.0, 0.0, -40.0], "FH-r": [-95.0, 0.0, -40.0]}  # in the femora
     text = {"space": "LPS", "unit": "mm", "landmarks": points}
     (folder / "landmarks.json").write_text(json.dumps(text), encoding="utf-8")
     trimesh.creation.box((10, 12, 40)).export(folder / "device.stl")
@@ -129,7 +130,7 @@ def no_landmarks_to_see(_folder: Path) -> None:
     [
         (no_ct, "ct.nii.gz"),
         (broken_ct, "ct.nii.gz"),
-        (labels_elsewhere, "no voxel carries the label"),
+        (labels_elsewhere, "FH-r of the femur_right lie on the pelvis"),
         (landmark_outside, "GSN-l"),
         (oblong_image, f"{SIZE} × {SIZE}"),
         (colour_image, "view1.tif"),

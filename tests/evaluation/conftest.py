@@ -10,6 +10,7 @@ import trimesh
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.case import Case, Model, ObjectQuality, Result, Start, View, result_content, write_case, write_json
 from femoreg_torch.case.femoroplasty import Device, femoroplasty_objects, planned
+from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.fluoro import write_image
 from femoreg_torch.geometry import Camera, CArm, centred_camera, poses_by_object, rigid
 from femoreg_torch.volume import Volume, axis_aligned, write_landmarks, write_volume
@@ -91,12 +92,13 @@ def make_procedure(tmp_path: Path) -> tuple[Path, Path]:
     run = tmp_path / "run"
     run.mkdir()
     doubtful = ObjectQuality((), 0.1, (0.1, 0.1), (0.1, 0.1, 0.1), (0.1, 0.1, 0.1), None, False, "similarity <0.2")
+    points_told, directions_told = path_in_camera1(case, truth)
     result = Result(
         truth,
         quality=dict.fromkeys(case.objects, doubtful),
         path=("femur", "device"),
-        points_camera1={"entry_point": torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)},
-        directions_camera1={"path": torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)},
+        points_camera1={"entry_point": points_told["entry_point"]},
+        directions_camera1={"path": directions_told["path"]},
         timings_s={"registration": 1.5},
         skipped=("there are no lateral images",),
         preset="paper",

@@ -35,7 +35,7 @@ def report_page(case: Case, scene: Scene, result: Result, errors: dict[str, Any]
         title=case.folder.resolve().name,
         side=case.side,
         views=len(case.views),
-        simulated=case.truth is not None and case.anchor in case.truth.camera1_from,
+        simulated=case.truth_source == "simulation",
         notice=NOTICE,
         card=card(case, result),
         sections=[section for section in made if section is not None],

@@ -57,7 +57,7 @@ def errors(material: Material) -> Section | None:
     case, found = material.case, material.errors
     if found is None or case.truth is None:
         return None
-    origin = _SIMULATED if case.anchor in case.truth.camera1_from else _MEASURED
+    origin = _ORIGINS[case.truth_source]
     paragraphs = [origin, _BESIDE_THE_PAPER]
     tables = [
         Table(METRIC_COLUMNS, list(metric_rows(found)), "What steers the drill"),
@@ -130,8 +130,13 @@ SECTIONS: tuple[Callable[[Material], Section | None], ...] = (
     configuration,
 )
 
-_SIMULATED = "The images of this case are simulated, and so is the truth that the errors are measured against."
-_MEASURED = "The truth that the errors are measured against was itself measured, by beads, and has an error of its own."
+_ORIGINS = {
+    "simulation": "The images of this case are simulated, and so is the truth that the errors are measured against.",
+    "beads": (
+        "The truth that the errors are measured against was itself measured, by beads, and has an error of its own."
+    ),
+    None: "The truth that the errors are measured against came with the case, which does not say how it was found.",
+}
 _BESIDE_THE_PAPER = (
     "Absolute errors of this one registration. Beside them the means of the paper's 1,000 simulations (Tables I and "
     "II), made on another anatomy with another simulator."
