@@ -8,6 +8,7 @@ from pathlib import Path
 
 from femoreg_torch.beads.writing import UNCERTAINTY_NAME, bead_points
 from femoreg_torch.case import RESULT_NAME, Result, read_case, read_result
+from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.model import Side
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import PAPER_METRICS, errors
@@ -60,11 +61,12 @@ def read_trial(place: Path, run: str) -> Trial:
             f"{place}: has no {missing[0]}: beads and result must both place the object with the planned path and its "
             "tool."
         )
-    sure = read_json(place / UNCERTAINTY_NAME)["metrics"]
+    path = place / UNCERTAINTY_NAME
+    sure = Fields(read_json(path), str(path)).mapping("metrics")
     return Trial(
         place.name,
         case.side,
         {key: found[key] for key in PAPER_METRICS},
-        {key: sure[key] for key in PAPER_METRICS},
+        {key: sure.number(key) for key in PAPER_METRICS},
         result,
     )

@@ -88,6 +88,9 @@ class LoadSettings:
     cap_mm: float
 
     def __post_init__(self) -> None:
+        _within("load", 90, adduction_deg=self.adduction_deg, internal_rotation_deg=self.internal_rotation_deg)
+        _within("load", 90, stance_deg=self.stance_deg)
+        _not_negative("load", cap_mm=self.cap_mm)
         _positive(
             "load",
             pad_depth_mm=self.pad_depth_mm,
@@ -123,6 +126,8 @@ class CurveSettings:
             newton_steps=self.newton_steps,
             tolerance=self.tolerance,
         )
+        if self.pistoia_share >= 1:
+            raise InputError(f"curve.pistoia_share: below 1 was expected, found {self.pistoia_share:g}.")
 
 
 @dataclass(frozen=True)
@@ -137,6 +142,7 @@ class DistributionSettings:
     cortex_g_cc: float
 
     def __post_init__(self) -> None:
+        _not_negative("distribution", clearance_mm=self.clearance_mm)
         _positive("distribution", steps=self.steps, filter_mm=self.filter_mm, cortex_g_cc=self.cortex_g_cc)
 
 
@@ -167,8 +173,18 @@ class PathSettings:
             evaluations=self.evaluations,
             compared=self.compared,
         )
-        if min(self.polish, self.fine) < 0:
-            raise InputError(f"path: polish and fine of 0 or more were expected, found {self.polish} and {self.fine}.")
+        _not_negative(
+            "path",
+            target_mm=self.target_mm,
+            angle_deg=self.angle_deg,
+            clearance_mm=self.clearance_mm,
+            entry_free_mm=self.entry_free_mm,
+            tip_clearance_mm=self.tip_clearance_mm,
+            entry_angle_deg=self.entry_angle_deg,
+            polish=self.polish,
+            fine=self.fine,
+        )
+        _within("path", 90, angle_deg=self.angle_deg, entry_angle_deg=self.entry_angle_deg)
         if self.most_axis_mm <= self.least_axis_mm:
             raise InputError("path.most_axis_mm: more than least_axis_mm was expected.")
 
@@ -198,6 +214,9 @@ class OffsetSettings:
 
     moves: Literal["path", "pattern"]
     distance_mm: float
+
+    def __post_init__(self) -> None:
+        _positive("offsets", distance_mm=self.distance_mm)
 
 
 @dataclass(frozen=True)
@@ -239,3 +258,15 @@ def _positive(group: str, **values: float) -> None:
     for key, value in values.items():
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{group}.{key}: a number above 0 was expected, found {value:g}.")
+
+
+def _not_negative(group: str, **values: float) -> None:
+    for key, value in values.items():
+        if not (math.isfinite(value) and value >= 0):
+            raise InputError(f"{group}.{key}: 0 or more was expected, found {value:g}.")
+
+
+def _within(group: str, most: float, **values: float) -> None:
+    for key, value in values.items():
+        if not abs(value) <= most:
+            raise InputError(f"{group}.{key}: −{most:g} to {most:g} was expected, found {value:g}.")

@@ -1,6 +1,7 @@
 """From a case with beads in CT and images to its truth, a case without beads, and Table III."""
 
 import csv
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import yaml
 from femoreg_torch.beads import find_spots, read_trials
 from femoreg_torch.case import ObjectQuality, Result, read_case, result_content, write_json
 from femoreg_torch.commands.main import main
+from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json
 from femoreg_torch.fluoro import attenuation_image, read_image, write_image
 from femoreg_torch.geometry import (
@@ -155,6 +157,11 @@ def test_beads_give_the_truth_and_are_taken_out(
         assert trial.errors["entry_point_mm"] == pytest.approx(offset, abs=1e-6)
         assert trial.errors["relative_mm"] == pytest.approx(offset, abs=1e-6)
         assert trial.truth["entry_point_mm"] > 0.05
+    told = json.loads((out / "truth_uncertainty.json").read_text(encoding="utf-8"))
+    (out / "truth_uncertainty.json").write_text(json.dumps(told | {"metrics": {}}), encoding="utf-8")
+    with pytest.raises(InputError, match=r"truth_uncertainty\.json, metrics\.\w+: is missing"):
+        read_trials(tmp_path / "trials")
+    (out / "truth_uncertainty.json").write_text(json.dumps(told), encoding="utf-8")
     capsys.readouterr()
     assert main(["beads-table", str(tmp_path / "trials")]) == 0
     printed = capsys.readouterr().out

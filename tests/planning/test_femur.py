@@ -289,8 +289,26 @@ def test_presets_are_checked(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="size_mm"):
         load_planning(path)
     path.write_text("extends: default\npath: {polish: -1}\n", encoding="utf-8")
-    with pytest.raises(InputError, match="path: polish and fine of 0 or more were expected, found -1 and 2"):
+    with pytest.raises(InputError, match=r"path\.polish: 0 or more was expected, found -1"):
         load_planning(path)
     path.write_text("extends: default\nmesh: {sise_mm: 3}\n", encoding="utf-8")
     with pytest.raises(InputError, match="sise_mm"):
         load_planning(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("curve: {pistoia_share: 2}", r"curve\.pistoia_share: below 1 was expected"),
+        ("load: {adduction_deg: 400}", r"load\.adduction_deg: −90 to 90 was expected, found 400"),
+        ("load: {cap_mm: -1}", r"load\.cap_mm: 0 or more"),
+        ("path: {angle_deg: 120}", r"path\.angle_deg: −90 to 90"),
+        ("path: {target_mm: -3}", r"path\.target_mm: 0 or more"),
+        ("distribution: {clearance_mm: -1}", r"distribution\.clearance_mm: 0 or more"),
+        ("offsets: {distance_mm: 0}", r"offsets\.distance_mm: a number above 0"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(tmp_path: Path, change: str, told: str) -> None:
+    (tmp_path / "mine.yaml").write_text(f"extends: default\n{change}\n", encoding="utf-8")
+    with pytest.raises(InputError, match=told):
+        load_planning(tmp_path / "mine.yaml")
