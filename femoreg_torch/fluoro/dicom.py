@@ -124,7 +124,10 @@ def _read(path: Path, frames: Frames | None) -> DicomImage:
     relation = str(find_value(dataset, "PixelIntensityRelationship") or "")
     values, lowest, highest, linear = _after_modality(dataset, stored, relation)
     sign = find_value(dataset, "PixelIntensityRelationshipSign")
-    inverted = sign == -1 if sign is not None else dataset.get("PhotometricInterpretation") == "MONOCHROME1"
+    if sign is None:
+        inverted = dataset.get("PhotometricInterpretation") == "MONOCHROME1"
+    else:  # of the stored pixels, which a rescale may have turned over (PS3.3, C.8.11.3.1.2)
+        inverted = (sign == -1) != (float(dataset.get("RescaleSlope") or 1) < 0)
     if inverted and not linear:  # a LUT to linear values says itself which are high
         values = lowest + highest - values
     remarks = [SCREEN] if of_a_screen and int(dataset.get("BitsStored", 16)) <= 8 else []

@@ -368,7 +368,8 @@ def _multi_frame(path: Path) -> sitk.Image:
     import highdicom  # half a second, and few CTs are of this kind
 
     try:  # what pydicom and highdicom raise for tags that lack or contradict one another, and for broken pixels
-        volume = highdicom.imread(path).get_volume(dtype=np.float32)
+        # HU are what the rescale gives; a map of real-world values may tell iodine or density
+        volume = highdicom.imread(path).get_volume(dtype=np.float32, apply_real_world_transform=False)
     except (AttributeError, KeyError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: its frames cannot be read as one volume ({error}). Export the series with a file for each slice."

@@ -85,6 +85,8 @@ def test_all_depths_and_both_photometric_interpretations_give_one_image(tmp_path
     np.testing.assert_array_equal(values(shown_so), plain)
     signed = {"PixelIntensityRelationship": "LIN", "PixelIntensityRelationshipSign": -1}
     np.testing.assert_array_equal(values(write(tmp_path, inverse, **depth, **signed)), plain)
+    turned = {"RescaleSlope": -1, "RescaleIntercept": 2**bits - 1}  # of a file whose rescale turns them over itself
+    np.testing.assert_array_equal(values(write(tmp_path, inverse, **depth, **signed, **turned)), plain)
     # The sign tells what is physical; how it is shown does not matter then.
     signed = {"PixelIntensityRelationship": "LIN", "PixelIntensityRelationshipSign": 1}
     raw = write(tmp_path, pixels, PhotometricInterpretation="MONOCHROME1", **depth, **signed)

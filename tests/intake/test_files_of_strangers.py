@@ -79,8 +79,9 @@ def test_a_ct_written_from_scratch(tmp_path: Path, plain: Volume, kind: str) -> 
     assert any("80 × 52 × 60 voxels of 4 × 4 × 4 mm" in fact for fact in found.facts), found.facts
 
 
-def test_an_enhanced_ct_written_from_scratch(tmp_path: Path, plain: Volume) -> None:
-    """Frames in no order, their places in the groups of each frame."""
+@pytest.mark.parametrize("mapped", [False, True])
+def test_an_enhanced_ct_written_from_scratch(tmp_path: Path, plain: Volume, mapped: bool) -> None:
+    """Frames in no order, their places in the groups of each frame; mapped: to iodine too, which is no HU."""
     data = header(EnhancedCTImageStorage)
     data.SeriesInstanceUID, data.InstanceNumber, data.ContentDate, data.ContentTime = (
         generate_uid(),
@@ -99,6 +100,13 @@ def test_an_enhanced_ct_written_from_scratch(tmp_path: Path, plain: Volume) -> N
     rescale.RescaleSlope, rescale.RescaleIntercept, rescale.RescaleType = 1, -1024, "HU"
     shared.PixelMeasuresSequence, shared.PlaneOrientationSequence = [measures], [axes]
     shared.PixelValueTransformationSequence = [rescale]
+    if mapped:
+        mapping, unit = Dataset(), Dataset()
+        unit.CodeValue, unit.CodingSchemeDesignator, unit.CodeMeaning = "mg/cm3", "UCUM", "mg/cm3"
+        mapping.MeasurementUnitsCodeSequence, mapping.LUTLabel, mapping.LUTExplanation = [unit], "I", "iodine"
+        mapping.RealWorldValueFirstValueMapped, mapping.RealWorldValueLastValueMapped = 0, 4095
+        mapping.RealWorldValueIntercept, mapping.RealWorldValueSlope = -500.0, 0.5
+        shared.RealWorldValueMappingSequence = [mapping]
     data.SharedFunctionalGroupsSequence = [shared]
     frames = []
     for n, k in enumerate(order.tolist()):
