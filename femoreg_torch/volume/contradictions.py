@@ -13,10 +13,11 @@ from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.labels import label_box
 
 _MEDIANS_MM, _SHIFTS_MM = 3.0, 2.0  # apart are the voxels that are looked at, or as far as the CT's own
-# Median HU. Of right CTs, sparse bone and bones without soft tissue too: labels 30 to 700, what lies 6 to 9 mm
+# HU. Of right CTs, sparse bone and bones without soft tissue too: labels 30 to 700 in the median, what lies 6 to 9 mm
 # beside them −1000 to 110. With the intercept of −1024 applied twice, labels −770; never applied, beside them 1070.
-_LEAST_BONE_HU, _MOST_SOFT_HU = -150.0, 350.0
-_MOST_VALUES = 20_000  # a median needs no more
+# Bones of plastic foam are as light, but their shells are not: of real ones the densest twentieth then has −380 to 290.
+_LEAST_BONE_HU, _LEAST_CORTEX_HU, _MOST_SOFT_HU = -150.0, 350.0, 350.0
+_MOST_VALUES = 20_000  # a quantile needs no more
 _REACH_MM = 15.0  # how far a label map is looked for
 _BRIGHT_HU = 150.0, 550.0  # from here on a voxel is bone, from there on it is no more so
 _LEAST_SHIFT_MM = 2.5
@@ -30,8 +31,9 @@ def wrong_hounsfield(ct: Volume, labels: Volume) -> str | None:
     if not inside.any():
         return None
     near, far = (_grown(inside, by) for by in (1, 3))
-    bone, soft = _median(data[inside]), _median(data[far & ~near])
-    if bone < _LEAST_BONE_HU:
+    bone, cortex = _quantile(data[inside], 0.5), _quantile(data[inside], 0.95)
+    soft = _quantile(data[far & ~near], 0.5)
+    if bone < _LEAST_BONE_HU and cortex < _LEAST_CORTEX_HU:
         return (
             f"CT: in the median the bones of the label map have {bone:.0f} HU: is the intercept of the scanner's "
             "rescale applied twice, or do CT and label map not belong to one another? Export the CT in HU"
@@ -79,9 +81,9 @@ def _steps(volume: Volume, apart_mm: float) -> tuple[slice, slice, slice]:
     return z, y, x
 
 
-def _median(values: Tensor) -> float:
+def _quantile(values: Tensor, share: float) -> float:
     """Of some of the values (N,); nan of none."""
-    return float(values[:: 1 + len(values) // _MOST_VALUES].float().median()) if len(values) else math.nan
+    return float(values[:: 1 + len(values) // _MOST_VALUES].float().quantile(share)) if len(values) else math.nan
 
 
 def _grown(mask: Tensor, by: int) -> Tensor:

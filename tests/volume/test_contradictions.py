@@ -34,6 +34,14 @@ def test_what_belongs_together_is_not_doubted(spacing: tuple[float, float, float
     assert misplaced_labels(bare, labels, IDS) is None
 
 
+def test_bones_of_foam_with_a_hard_shell_are_not_doubted() -> None:
+    """As those that are drilled in courses, in air."""
+    ct, labels = ct_and_labels()
+    foam = torch.where(labels.data > 0, torch.where(ct.data > 500, ct.data, -800.0), -1000.0)
+    assert wrong_hounsfield(ct.with_data(foam), labels) is None
+    assert misplaced_labels(ct.with_data(foam), labels, IDS) is None
+
+
 @pytest.mark.parametrize(("offset", "told"), [(-1024.0, "applied twice"), (1024.0, "is the rescale of the scanner")])
 def test_an_intercept_that_is_missing_or_there_twice_is_told(offset: float, told: str) -> None:
     ct, labels = ct_and_labels()
