@@ -1,11 +1,16 @@
 """Tables, overlay and report of a run, on a small case made here."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from femoreg_torch.case import read_case, read_result, write_json
 from femoreg_torch.commands.evaluate import evaluate
+from femoreg_torch.commands.main import main
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import PAPER_METRICS, PAPER_POSES
@@ -128,3 +133,36 @@ def test_a_result_of_another_case_is_refused(procedure):
     change_result(run, lambda c: c.update(camera1_from_tibia=c["camera1_from_femur"]))
     with pytest.raises(InputError, match=r"an object 'tibia', but .* has pelvis, femur, device"):
         evaluate(folder, run)
+
+
+def test_a_case_whose_plan_was_changed_since_is_refused(
+    procedure: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, run = procedure
+    content = yaml.safe_load((folder / "case.yaml").read_text(encoding="utf-8"))
+    content["plan"]["entry_point"][0] += 3
+    (folder / "case.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    assert main(["evaluate", str(folder), str(run)]) == 2
+    assert "its entry point is another one than the result tells" in capsys.readouterr().err
+    assert not (run / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("simulation", "are simulated, and so is the truth"),
+        ("beads", "by beads"),
+        (None, "does not say how it was found"),
+    ],
+)
+def test_the_report_says_where_the_truth_comes_from(
+    procedure: tuple[Path, Path], source: str | None, says: str
+) -> None:
+    folder, run = procedure
+    content = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    told = {} if source is None else {"source": source}
+    (folder / "truth.json").write_text(json.dumps(told | content), encoding="utf-8")
+    assert main(["evaluate", str(folder), str(run)]) == 0
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert says in page
+    assert ("simulated images" in page) == (source == "simulation")

@@ -48,7 +48,7 @@ def commands(given: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str
     monkeypatch.setattr(femoreg_torch.registration.run, "register_scene", lambda *_, **__: (result, None))
     monkeypatch.setattr(femoreg_torch.evaluation, "evaluate", lambda *_: None)
     for name, value in {
-        "check_fits": None, "prepare_scene": None, "evaluate": None, "draw": None,
+        "check_fits": None, "check_plan_fits": None, "prepare_scene": None, "evaluate": None, "draw": None,
         "overlay_figure": np.zeros((9, 9, 3), np.uint8),
     }.items():  # fmt: skip
         monkeypatch.setattr(femoreg_torch.evaluation.run, name, lambda *_, value=value: value)

@@ -39,5 +39,5 @@ def test_the_pelvis_comes_back(case: Path, tmp_path: Path) -> None:
     found = single_view_registration(case, str(preset))(labelled, shift @ about_point(turn, middle) @ TRUTH)
     assert torch.rad2deg(rotation_angle(TRUTH[:3, :3].mT @ found[:3, :3])) < 0.3
     off = (transform_points(found, torch.zeros(1, 3).double()) - middle)[0]
-    assert off[:2].norm() < 1  # of 5
+    assert off[:2].norm() < 1.5  # of 5; pixels have 1.55 mm, and processors round differently
     assert off[2].abs() < 5  # one view hardly tells the depth
