@@ -157,7 +157,8 @@ def plan_robustness(
     from femoreg_torch.planning.report import read_plan
 
     console = Console()
-    count = read_plan(plan).planning.robustness.draws if draws is None else draws
+    stored = read_plan(plan)
+    count = stored.planning.robustness.draws if draws is None else draws
     if count < 1:
         raise InputError(f"--draws: 1 or more was expected, found {count}.")
     if (study is None) == (covariance is None):
@@ -165,7 +166,7 @@ def plan_robustness(
     if study is not None:
         if mean is not None:
             raise InputError("--mean: belongs to --covariance; a study has its own.")
-        moves = study_moves(study, count, seed)  # first: the femur takes a while
+        moves = study_moves(study, stored.side, count, seed)  # first: the femur takes a while
     else:
         assert covariance is not None  # one of the two
         variance = read_covariance(covariance)

@@ -23,6 +23,7 @@ from femoreg_torch.text import read_bytes
 Array = NDArray[np.float64]
 
 _MOST_BYTES = 2**16  # of a covariance as text
+_MIRRORED = np.array([-1.0, 1, 1, 1, -1, -1])  # a shift, then a turn, of LPS, seen in a mirror of left and right
 _AXES = ("lr", "ap", "is")  # of a study's signed columns, as LPS: to the left, to the back, to the head
 
 
@@ -151,16 +152,16 @@ def _covariance_of(result: Result, file: File) -> Array:
     return np.asarray(result.path_covariance.numpy(), float)
 
 
-def study_moves(folder: File, draws: int, seed: int) -> Array:
-    """Moves (draws, 6), mm and degrees, drawn from the runs of a study with replacement.
+def study_moves(folder: File, side: Side, draws: int, seed: int) -> Array:
+    """Moves (draws, 6), mm and degrees, of a femur of that side, drawn from the runs of a study with replacement.
 
     `folder` holds `runs.parquet` or `runs.csv` with signed errors (estimate minus truth). The robot brings the device
     where both are believed to fit, so that it ends beside the planned place in the bone by the bone's error minus the
     device's: at the entry point by `entry_point_mm_lr|ap|is` minus `tip_mm_…`, or, in tables without these, by
     `femur_mm_…` minus `device_mm_…` at their reference points; turned by `femur_deg_…` minus `device_deg_…`, where both
-    are there. The axes are those of the first view, taken for the patient's: left, back, head. Runs that were not
-    trusted would not have been carried out, and are left out. Raises `InputError` for a missing file or column, or if
-    no run is left.
+    are there. The axes are those of the first view, taken for the patient's: left, back, head; runs of the other side
+    are mirrored. Runs that were not trusted would not have been carried out, and are left out. Raises `InputError` for
+    a missing file or column, or if no run is left.
     """
     table = _read_runs(folder)
     exact = all(f"{name}_mm_{axis}" in table for name in ("entry_point", "tip") for axis in _AXES)
@@ -185,6 +186,9 @@ def study_moves(folder: File, draws: int, seed: int) -> Array:
     found[:, :3] = values[:, :3] - values[:, 3:6]
     if values.shape[1] > 6:
         found[:, 3:] = values[:, 6:9] - values[:, 9:]
+    if "side" in table:
+        other = np.array([value not in (side, "") for value in table["side"]], bool)[kept]
+        found[other] *= _MIRRORED
     return np.asarray(found[np.random.default_rng(seed).integers(len(found), size=draws)])
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path as File
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 import femoreg_torch
 from femoreg_torch.case import Case
 from femoreg_torch.case.fields import Fields
+from femoreg_torch.case.model import Side
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json, temporary_file, write_json
 from femoreg_torch.planning.curve import Curve
@@ -98,6 +99,7 @@ class StoredPlan:
     """What is read back of a plan."""
 
     case: File
+    side: Side
     path: Path
     planning: Planning
     baseline_n: float
@@ -126,12 +128,13 @@ def read_plan(folder: File) -> StoredPlan:
         entry, target = (plan.point(key).numpy() for key in ("entry_point", "target"))
         loads = [Fields(content, where).mapping(key).number("yield_load_n") for key in ("baseline", "planned")]
         case = File(content["case"])
+        side = cast(Side, Fields(content, where).choice("side", ("left", "right")))
     except InputError:
         raise
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{where}: is no plan of `femoreg plan` ({error} is missing or wrong).") from error
     cement = read_label_map(folder / CEMENT_NAME).data.numpy().transpose(2, 1, 0)
-    return StoredPlan(case, Path(entry, target, ellipsoids), planning, loads[0], loads[1], cement.astype(float))
+    return StoredPlan(case, side, Path(entry, target, ellipsoids), planning, loads[0], loads[1], cement.astype(float))
 
 
 def _markup(path: Path) -> dict[str, Any]:

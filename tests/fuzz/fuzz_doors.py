@@ -422,7 +422,7 @@ def _others(folder: Path) -> Iterator[Door]:
     plan = {
         "settings": load_preset("planning", "default"), "case": "../case", "baseline": {"yield_load_n": 1000.0},
         "plan": {"entry_point": [0.0, 1.0, 2.0], "target": [3.0, 4.0, 5.0]}, "planned": {"yield_load_n": 2000.0},
-        "injections": [],
+        "injections": [], "side": "left",
     }  # fmt: skip
     sitk.WriteImage(sitk.Image(3, 3, 3, sitk.sitkUInt8), str(folder / CEMENT_NAME))
     yield Door("plan", folder / "plan.json", lambda: read_plan(folder), _text(folder / "plan.json", plan))
