@@ -181,10 +181,10 @@ def read_display(fields: Fields) -> Display:
     for key, flag in flags.items():
         if not isinstance(flag, bool):
             raise InputError(f"{display.where(key)}: true or false was expected, found {flag!r}.")
-    if not isinstance(turned, int) or isinstance(turned, bool) or turned not in TURNS:
+    if not isinstance(turned, int | float) or isinstance(turned, bool) or turned not in TURNS:
         known = ", ".join(map(str, TURNS))
         raise InputError(f"{display.where('turned')}: degrees clockwise, {known}, were expected, found {turned!r}.")
-    return Display(source, flags["mirrored"], turned, flags["ignore_header"])
+    return Display(source, flags["mirrored"], int(turned), flags["ignore_header"])
 
 
 def read_frames(view: Fields) -> Frames | None:

@@ -12,7 +12,9 @@ from femoreg_torch.volume import read_landmarks
 
 COLUMNS = ("landmark", "column_px", "row_px")
 _POSE = "camera1_from_"
-_VISIBLE = {"1": True, "true": True, "yes": True, "0": False, "false": False, "no": False}  # as spreadsheets write them
+_VISIBLE = {  # as spreadsheets and pandas write them
+    "1": True, "1.0": True, "true": True, "yes": True, "0": False, "0.0": False, "false": False, "no": False,
+}  # fmt: skip
 _FARTHEST_PX = 1e5  # of a landmark, which may lie outside of the image
 
 

@@ -1,5 +1,7 @@
 """Reading and writing of fluoroscopic images."""
 
+import struct
+import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
@@ -10,8 +12,7 @@ import cv2
 import numpy as np
 import SimpleITK as sitk
 import torch
-from PIL import Image
-from PIL.TiffImagePlugin import PHOTOMETRIC_INTERPRETATION, TiffImageFile
+from PIL import ExifTags, Image
 from torch import Tensor
 
 from femoreg_torch.arrays import MOST_PIXELS, quiet
@@ -33,6 +34,7 @@ _SCREEN_SUFFIXES = (".jpg", ".jpeg", ".bmp")  # what nobody stores intensities i
 LOOKS_LOG = "looks like logarithms already"  # what a file of fractions asks the case about
 _LOG_RANGE = (2.0, 20.0)  # of the greatest attenuation in an image: 45 cm of water at 60 keV are 9
 _MOST_PICTURE_BYTES = 2**28  # what the most pixels have as floats
+_PHOTOMETRIC_INTERPRETATION = 262  # a tag of TIFF
 _GREY_STEPS = 12  # by which the colours of a grey JPEG may differ
 
 
@@ -63,25 +65,42 @@ def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
             f"{path}: cannot be read as a PNG, TIFF or JPEG image of at most {MOST_PIXELS} pixels; the file is damaged "
             "or something else."
         )
-    remarks = []
+    if path.suffix.lower() not in _PAGED_SUFFIXES and _is_shown_turned(content):  # of TIFF files OpenCV turns them
+        raise InputError(
+            f"{path}: says that it is to be shown turned or mirrored (EXIF). Save it as it is to be shown."
+        )
     if path.suffix.lower() in _PAGED_SUFFIXES and image.dtype != np.uint8 and _white_is_zero(content):
-        if image.dtype != np.uint16:
-            raise InputError(f"{path}: says that 0 is white (WhiteIsZero). Save it with 0 as black (BlackIsZero).")
-        image = np.iinfo(np.uint16).max - image  # of 8 bits OpenCV has done so
-        remarks.append("says that 0 is white (WhiteIsZero): its values were turned over")
+        raise InputError(f"{path}: says that 0 is white (WhiteIsZero). Save it with 0 as black (BlackIsZero).")
     screen = path.suffix.lower() in _SCREEN_SUFFIXES or (path.suffix.lower() == ".png" and image.dtype == np.uint8)
     if image.ndim == 3 and image.shape[-1] in (3, 4):
         colours = image[..., :3].astype(np.int64)
         if np.ptp(colours, axis=-1).max() <= (_GREY_STEPS if path.suffix.lower() in _SCREEN_SUFFIXES else 0):
             image, screen = image[..., 1], True
-    return image, (*remarks, SCREEN) if screen else tuple(remarks)
+    return image, (SCREEN,) if screen else ()
 
 
 def _white_is_zero(tiff: bytes) -> bool:
-    """Whether a TIFF file says that its least value is white (tag 262, PhotometricInterpretation, is 0)."""
-    with suppress(OSError, SyntaxError, ValueError), Image.open(BytesIO(tiff)) as picture:
-        return isinstance(picture, TiffImageFile) and picture.tag_v2.get(PHOTOMETRIC_INTERPRETATION) == 0
-    return False  # what Pillow does not know of
+    """Whether a TIFF file says that its least value is white; OpenCV turns over those of 8 bits alone.
+
+    The first directory is looked through by itself, as Pillow does not open all kinds of numbers (TIFF 6.0, section 2).
+    """
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    with suppress(struct.error):
+        if order is not None and tiff[2:4] in (b"*\0", b"\0*"):
+            (place,) = struct.unpack_from(f"{order}I", tiff, 4)
+            (count,) = struct.unpack_from(f"{order}H", tiff, place)
+            entries = (struct.unpack_from(f"{order}HHIH", tiff, place + 2 + 12 * n) for n in range(count))
+            return any(tag == _PHOTOMETRIC_INTERPRETATION and value == 0 for tag, _, _, value in entries)
+    return False
+
+
+def _is_shown_turned(picture: bytes) -> bool:
+    """Whether a PNG or JPEG file says by its EXIF orientation that viewers are to turn it."""
+    with warnings.catch_warnings(), suppress(OSError, SyntaxError, ValueError):
+        warnings.simplefilter("ignore")  # of damaged EXIF data
+        with Image.open(BytesIO(picture)) as opened:
+            return opened.getexif().get(ExifTags.Base.Orientation, 1) != 1
+    return False
 
 
 def _read_itk(path: Path) -> np.ndarray:

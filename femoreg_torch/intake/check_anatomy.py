@@ -23,13 +23,13 @@ from femoreg_torch.volume import (
     Volume,
     bone_labels,
     check_inside,
+    densities,
     merged_bones,
     misplaced_labels,
     read_ct_told,
     read_labels_told,
     stray_landmarks,
     swapped_sides,
-    wrong_hounsfield,
 )
 from femoreg_torch.volume.bones import nearest_label
 
@@ -70,10 +70,13 @@ def check_bones(
     path: Path, ct: Volume, table: LabelTable, anatomy: Anatomy | None, marks: Mapping[str, Tensor], found: Found
 ) -> BoneLabels:
     labels, told = read_labels_told(path, ct, {n for ids in table.values() for n in ids})
-    found.warnings += [*told, *header_warnings(path)]
+    found.warnings += [*told, *(f"{path.name}: {warning}" for warning in header_warnings(path))]
     bones = bone_labels(labels, ct, table, anatomy, marks)
-    if (wrong := wrong_hounsfield(ct, bones.labels)) is not None:
-        found.problem(f"{wrong}.")
+    seen = densities(ct, bones.labels)
+    if seen.unscaled is not None:
+        found.problem(f"{seen.unscaled}.")
+    elif seen.light is not None:
+        found.warnings.append(seen.light)
     elif (misplaced := misplaced_labels(ct, bones.labels, list(bones.ids.values()))) is not None:
         found.warnings.append(misplaced)
     found.facts.append(f"bones: {', '.join(bones.ids)}")

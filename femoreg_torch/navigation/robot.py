@@ -11,7 +11,7 @@ from femoreg_torch.geometry import check_rigid, read_itk_transform, rigid
 from femoreg_torch.text import MOST_YAML_BYTES, read_bytes
 
 _LEAST_REACH_MM = 10.0  # no tool or flange stands this close to the base of its robot: the numbers are metres
-_LEAST_TOOL_MM = 2.0  # a tool's origin in its flange is the flange's own, or farther from it: else these are metres
+_TOOL_IN_METRES = 0.02, 2.0  # so far a tool's origin lies from its flange in m, and hardly any in mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +66,8 @@ def read_robot(path: Path, tool: str) -> Robot:
         base_from_tool = poses[f"base_from_{tool}"]
     else:
         flange_from_tool = poses[f"flange_from_{tool}"]
-        if 0 < (distance := flange_from_tool[:3, 3].norm().item()) < _LEAST_TOOL_MM:
-            raise _in_metres(path, tool, distance, "its flange")
+        if _TOOL_IN_METRES[0] < (distance := flange_from_tool[:3, 3].norm().item()) < _TOOL_IN_METRES[1]:
+            raise _in_metres(path, tool, distance, "its flange", f" If it does, give `base_from_{tool}` alone.")
         if (distance := base_from_flange[:3, 3].norm().item()) < _LEAST_REACH_MM:
             raise _in_metres(path, "flange", distance, "the robot's base")
         base_from_tool = base_from_flange @ flange_from_tool
@@ -76,10 +76,10 @@ def read_robot(path: Path, tool: str) -> Robot:
     return Robot(base_from_tool, base_from_flange)
 
 
-def _in_metres(path: Path, what: str, distance: float, place: str) -> InputError:
+def _in_metres(path: Path, what: str, distance: float, place: str, way_out: str = "") -> InputError:
     return InputError(
         f"{path}: the {what} would stand {in_mm(distance)} from {place}. Are the translations in metres? Write them in "
-        "mm."
+        f"mm.{way_out}"
     )
 
 

@@ -39,6 +39,7 @@ from femoreg_torch.volume import (
     Volume,
     bone_labels,
     check_inside,
+    densities,
     hu_to_attenuation,
     label_box_centre,
     merged_bones,
@@ -47,7 +48,6 @@ from femoreg_torch.volume import (
     resample_isotropic,
     structure_attenuation,
     swapped_sides,
-    wrong_hounsfield,
 )
 
 REGISTRATION_SPACING_MM = 1.0  # the paper resamples the CT to 1 mm (section III-A)
@@ -72,14 +72,14 @@ def prepare_scene(case: Case) -> Scene:
         if from_ct:
             ct, bones = read_bones(case)
             check_inside(case.landmarks, ct)
-            _check_anatomy(case, ct, bones)
+            told_of_ct = (*bones.notes, *_check_anatomy(case, ct, bones))
             _check_path(case, ct)
             soft = resample_isotropic(ct.with_data(ct.data.clamp_max(SOFT_HU)), TISSUE_SPACING_MM)
             tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
             outline = outline_of(bones, case.anatomy)
         images, fields, told = reading.result()
         if from_ct:
-            told = (*bones.notes, *told)
+            told = (*told_of_ct, *told)
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
         made = {name: model.result() for name, model in making.items()}
     for name, volumes in made.items():
@@ -113,15 +113,16 @@ def prepare_scene(case: Case) -> Scene:
     )
 
 
-def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> None:
-    """Raises `InputError` if CT, label map and landmarks contradict one another."""
-    told = [
-        *swapped_sides(bones, case.landmarks, case.anatomy),
-        *merged_bones(bones, case.landmarks, case.anatomy),
-        *filter(None, [wrong_hounsfield(ct, bones.labels)]),
-    ]
-    if told:
-        raise InputError(f"{case.folder}: {'; '.join(told)}.")
+def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]:
+    """What is strange of CT and label map, in words.
+
+    Raises `InputError` if they and the landmarks contradict one another.
+    """
+    told = swapped_sides(bones, case.landmarks, case.anatomy) or merged_bones(bones, case.landmarks, case.anatomy)
+    seen = densities(ct, bones.labels)
+    if wrong := [*told, *filter(None, [seen.unscaled])]:
+        raise InputError(f"{case.folder}: {'; '.join(wrong)}.")
+    return tuple(filter(None, [seen.light]))
 
 
 def _check_path(case: Case, ct: Volume) -> None:

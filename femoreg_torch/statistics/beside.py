@@ -106,7 +106,8 @@ def beside_table(first: pd.DataFrame, second: pd.DataFrame, names: tuple[str, st
         data.append(_numbers("success", found))
     how = "Paired: differences of the same procedures." if pairs is not None else "Not paired: different procedures."
     note = (
-        f"{how} 95 %: bootstrap of the difference, runs of one procedure drawn together; clear if it does not hold 0. "
+        f"{how} 95 %: bootstrap of the difference, runs of one procedure drawn together; clear if it does not hold 0, "
+        "– where it is not known, as of unpaired studies with several runs of a procedure. "
         "Runs that gave no error are in no mean; in the share of good runs they count as not good."
     )
     columns = ("mean error", "runs", *names, "difference", "95 %", "clear")
@@ -126,7 +127,7 @@ def _counts(found: Difference) -> str:
 
 
 def _clear(found: Difference) -> str:
-    return "yes" if found.clear else "no"
+    return "–" if np.isnan(found.interval[0]) and found.value != 0 else "yes" if found.clear else "no"
 
 
 def _numbers(column: str, found: Difference) -> dict[str, object]:

@@ -17,10 +17,10 @@ def pose_table(rows: pd.DataFrame) -> Table:
         if not found[0][1].asked:
             continue
         lines += [
-            (name, _count(found[0][1]), "mean ± SD", *(plus_minus(s.mean, s.deviation, q.digits) for q, s in found)),
-            ("", "", "median", *(number(s.median, q.digits) for q, s in found)),
-            ("", "", f"{PAPER}, mean ± SD", *(plus_minus(q.paper.mean, q.paper.deviation, 2) for q, _ in found)),
-            ("", "", f"{PAPER}, median", *(number(q.paper.median, 2) for q, _ in found)),
+            (name, "mean ± SD", _count(found[0][1]), *(plus_minus(s.mean, s.deviation, q.digits) for q, s in found)),
+            ("", "median", "", *(number(s.median, q.digits) for q, s in found)),
+            ("", f"{PAPER}, mean ± SD", "", *(plus_minus(q.paper.mean, q.paper.deviation, 2) for q, _ in found)),
+            ("", f"{PAPER}, median", "", *(number(q.paper.median, 2) for q, _ in found)),
         ]
         data += [error_numbers(q, s) for q, s in found]
     axes = [axis.upper() for axis in AXES]

@@ -24,10 +24,10 @@ def mean_interval(values: ArrayLike, seed: int, clusters: ArrayLike | None = Non
     if len(sample) < 2 or np.ptp(sample) == 0:
         return UNKNOWN  # a sample without spread says nothing about the spread
     cluster = np.arange(len(sample)) if clusters is None else np.unique(clusters, return_inverse=True)[1]
-    counts = np.bincount(cluster)
-    if len(counts) < 2:
+    sums, counts = np.bincount(cluster, sample), np.bincount(cluster)
+    if len(counts) < 2 or np.ptp(sums / counts) == 0:
         return UNKNOWN
-    return _bootstrap((np.bincount(cluster, sample), counts), _mean, seed, paired=True)
+    return _bootstrap((sums, counts), _mean, seed, paired=True)
 
 
 def difference_interval(first: ArrayLike, second: ArrayLike, seed: int) -> Interval:

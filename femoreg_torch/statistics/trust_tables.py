@@ -11,6 +11,8 @@ from femoreg_torch.statistics.summary import confusion, coverage, right_runs, tr
 _LIMITS_MM = (WRONG_MM, 2.0, 1.0)
 _WRONG = f"wrong: off by more than {WRONG_MM:g} mm or {WRONG_DEG:g}°, or not found"
 
+_NO_INTERVAL = "95 %: Wilson's interval; none where runs share a procedure."
+
 
 def success_table(rows: pd.DataFrame) -> Table:
     """Shares of runs that are good enough; refused and failed runs are not."""
@@ -26,7 +28,7 @@ def success_table(rows: pd.DataFrame) -> Table:
     rates = [(name, rate) for name, rate in rates if rate.of]
     lines = tuple((name, f"{rate.met} of {rate.of}", *rate_cells(rate)) for name, rate in rates)
     data = pd.DataFrame([{"criterion": name, **rate_numbers(rate)} for name, rate in rates])
-    note = "Refused and failed runs count as not met. 95 %: Wilson's interval; none where runs share a procedure."
+    note = "Refused and failed runs count as not met. " + _NO_INTERVAL
     return Table("success", "Success", note, ("", "runs", "rate", "95 %"), lines, data)
 
 
@@ -45,7 +47,10 @@ def trust_table(rows: pd.DataFrame) -> Table:
     columns = (
         "", "right, trusted", "right, flagged", "wrong, trusted", "wrong, flagged", "wrong of trusted", "95 %"
     )  # fmt: skip
-    note = f"{_WRONG[0].upper()}{_WRONG[1:]}; a whole run also if {RELATIVE.name} is off by more than {WRONG_MM:g} mm."
+    note = (
+        f"{_WRONG[0].upper()}{_WRONG[1:]}; a whole run also if {RELATIVE.name} is off by more than {WRONG_MM:g} mm. "
+        + _NO_INTERVAL
+    )
     return Table("trust", "Trust", note, columns, tuple(lines), pd.DataFrame(data))
 
 

@@ -2,7 +2,7 @@
 
 from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
 from femoreg_torch.volume.bones import BoneLabels, bone_labels
-from femoreg_torch.volume.contradictions import misplaced_labels, wrong_hounsfield
+from femoreg_torch.volume.contradictions import densities, misplaced_labels
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
 from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
 from femoreg_torch.volume.labels import label_box_centre, looked_up
@@ -35,6 +35,7 @@ __all__ = [
     "check_closed",
     "check_inside",
     "crop",
+    "densities",
     "halved",
     "has_names",
     "hu_to_attenuation",
@@ -67,5 +68,4 @@ __all__ = [
     "voxelise_mesh",
     "write_landmarks",
     "write_volume",
-    "wrong_hounsfield",
 ]

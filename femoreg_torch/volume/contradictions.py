@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,38 +19,53 @@ _MEDIANS_MM, _SHIFTS_MM = 3.0, 2.0  # apart are the voxels that are looked at, o
 # Bones of plastic foam are as light, but their shells are not: of real ones the densest twentieth then has −380 to 290.
 _LEAST_BONE_HU, _LEAST_CORTEX_HU, _MOST_SOFT_HU = -150.0, 350.0, 350.0
 _MOST_VALUES = 20_000  # a quantile needs no more
-_REACH_MM = 15.0  # how far a label map is looked for
+_REACH_MM = 18.0  # how far a label map is looked for: a best place beyond the farthest shift that is told is none
 _BRIGHT_HU = 150.0, 550.0  # from here on a voxel is bone, from there on it is no more so
-_LEAST_SHIFT_MM = 2.5
+_LEAST_SHIFT_MM, _MOST_SHIFT_MM = 2.5, 15.0
 _LEAST_GAIN = 0.15
 
 
-def wrong_hounsfield(ct: Volume, labels: Volume) -> str | None:
-    """In words, that a CT is not in HU, as its bones and what lies beside them say; None where they do not say so."""
+@dataclass(frozen=True)
+class Densities:
+    """What a CT holds where a label map has bone, and beside it: HU."""
+
+    bone: float  # median
+    cortex: float  # of the densest twentieth, the least
+    beside: float  # median of what lies some voxels beside the bones
+
+    @property
+    def unscaled(self) -> str | None:
+        """In words, that soft tissue is far too dense for HU; None where it is not."""
+        if not self.beside > _MOST_SOFT_HU:
+            return None
+        return (
+            f"CT: in the median what lies beside the bones has {self.beside:.0f} HU, and soft tissue has 50: is the "
+            "rescale of the scanner applied? Export the CT in HU"
+        )
+
+    @property
+    def light(self) -> str | None:
+        """In words, that bones are far too light for HU, unless they are of foam; None where they are not."""
+        if not (self.bone < _LEAST_BONE_HU and self.cortex < _LEAST_CORTEX_HU):
+            return None
+        return (
+            f"CT: in the median the bones of the label map have {self.bone:.0f} HU: is the intercept of the scanner's "
+            "rescale applied twice, or do CT and label map not belong to one another? Bones of foam are as light"
+        )
+
+
+def densities(ct: Volume, labels: Volume) -> Densities:
+    """Densities of a CT, HU, by a label map on its grid."""
     steps = _steps(ct, _MEDIANS_MM)
     data, inside = ct.data[steps], labels.data[steps] > 0
-    if not inside.any():
-        return None
     near, far = (_grown(inside, by) for by in (1, 3))
-    bone, cortex = _quantile(data[inside], 0.5), _quantile(data[inside], 0.95)
-    soft = _quantile(data[far & ~near], 0.5)
-    if bone < _LEAST_BONE_HU and cortex < _LEAST_CORTEX_HU:
-        return (
-            f"CT: in the median the bones of the label map have {bone:.0f} HU: is the intercept of the scanner's "
-            "rescale applied twice, or do CT and label map not belong to one another? Export the CT in HU"
-        )
-    if soft > _MOST_SOFT_HU:
-        return (
-            f"CT: in the median what lies beside the bones has {soft:.0f} HU, and soft tissue has 50: is the rescale "
-            "of the scanner applied? Export the CT in HU"
-        )
-    return None
+    return Densities(_quantile(data[inside], 0.5), _quantile(data[inside], 0.95), _quantile(data[far & ~near], 0.5))
 
 
 def misplaced_labels(ct: Volume, labels: Volume, ids: Sequence[int]) -> str | None:
     """In words, that the bones of these ids would lie on the bright ones of a CT if they were shifted, or None.
 
-    What is compared is how bright the labels' voxels are beyond what lies beside them, at all shifts of up to 15 mm.
+    What is compared is how bright the labels' voxels are beyond what lies beside them, at all shifts of up to 18 mm.
     """
     low, high = label_box(labels, ids)
     margin = [math.ceil(_REACH_MM / s) + 2 for s in labels.spacing_mm]
@@ -63,10 +79,14 @@ def misplaced_labels(ct: Volume, labels: Volume, ids: Sequence[int]) -> str | No
     reach = [math.ceil(_REACH_MM / (s * step.step)) for s, step in zip(ct.spacing_mm[::-1], steps, strict=True)]
     scores = _correlation(bright, kernel.numpy(), reach)
     here = scores[tuple(reach)]
+    apart_mm = [s * step.step for s, step in zip(ct.spacing_mm[::-1], steps, strict=True)]
+    along = np.meshgrid(*(np.arange(-r, r + 1) * mm for r, mm in zip(reach, apart_mm, strict=True)), indexing="ij")
+    scores[np.sqrt(sum(mm**2 for mm in along)) > _REACH_MM] = -np.inf
     best = np.unravel_index(int(scores.argmax()), scores.shape)
     voxels = [(b - r) * step.step for b, r, step in zip(best, reach, steps, strict=True)][::-1]
     shift = ct.lps_from_index[:3, :3] @ torch.tensor(voxels, dtype=torch.float64)
-    if float(shift.norm()) < _LEAST_SHIFT_MM or scores[best] < (1 + _LEAST_GAIN) * max(here, 0):
+    far, gained = float(shift.norm()), scores[best] > (1 + _LEAST_GAIN) * max(here, 0)
+    if not (_LEAST_SHIFT_MM <= far <= _MOST_SHIFT_MM and gained):
         return None
     told = ", ".join(f"{mm + 0.0:.0f}" for mm in shift.tolist())
     return (

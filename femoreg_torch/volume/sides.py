@@ -73,7 +73,8 @@ def merged_bones(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: An
         return []
     told = []
     for bone in (bone for bone in anatomy.bones if bone.name in bones.ids or bone.name in bones.absent):
-        given = [mark for mark in anatomy.landmarks_of(bone.name) if mark in landmarks]
+        marked = anatomy.landmarks_of(bone.name)
+        given = [mark for mark in marked if mark in landmarks]
         others = {n: name for name, n in bones.ids.items() if name != bone.name}
         own = [bones.ids[bone.name]] if bone.name in bones.ids else []
         on: dict[str, list[str]] = {}
@@ -85,7 +86,8 @@ def merged_bones(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: An
             if near is None or near[1] > _OFF_MM:
                 on.setdefault(others[found[0]], []).append(mark)
         for other, marks in on.items():
-            if 2 * len(marks) > len(given):
+            # one alone may be of the symphysis, which has a bone on either side
+            if 2 * len(marks) > len(given) and len(marks) >= min(2, len(marked)):
                 told.append(
                     f"label map: {', '.join(marks)} of the {bone.name} lie on the {other}: does the label map hold "
                     "both as one, or parts of one under the other's id? Part them"

@@ -10,6 +10,7 @@ import SimpleITK as sitk
 import tifffile
 import torch
 from fuzz_faults import full_after
+from PIL import Image
 from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
 
@@ -193,16 +194,30 @@ def test_an_image_is_not_written_into_a_folder_that_is_not_there(tmp_path: Path)
         write_image(tmp_path / "no" / "view.png", torch.from_numpy(PIXELS))
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_a_tiff_that_says_that_0_is_white_is_turned_over(tmp_path: Path, dtype: type) -> None:
-    pixels = (PIXELS // (1 if dtype is np.uint16 else 16)).astype(dtype)
+def test_a_tiff_of_8_bits_that_says_that_0_is_white_is_turned_over(tmp_path: Path) -> None:
+    pixels = (PIXELS // 16).astype(np.uint8)
+    tifffile.imwrite(tmp_path / "view.tif", pixels, photometric="miniswhite")
+    np.testing.assert_array_equal(read_image(tmp_path / "view.tif").numpy(), 255 - pixels)
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.int16, np.uint32, np.int32, np.float32, np.float64])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_other_tiffs_that_say_that_0_is_white_are_refused(tmp_path: Path, dtype: type, order: str) -> None:
+    """How bright their white is, they do not say: 12 bits often stand in 16."""
     for kind in ("minisblack", "miniswhite"):
-        tifffile.imwrite(tmp_path / f"{kind}.tif", pixels, photometric=kind)
-    np.testing.assert_array_equal(read_image(tmp_path / "minisblack.tif").numpy(), pixels)
-    np.testing.assert_array_equal(read_image(tmp_path / "miniswhite.tif").numpy(), np.iinfo(dtype).max - pixels)
+        tifffile.imwrite(tmp_path / f"{kind}.tif", PIXELS.astype(dtype), photometric=kind, byteorder=order)
+    np.testing.assert_array_equal(read_image(tmp_path / "minisblack.tif").numpy(), PIXELS)
+    with pytest.raises(InputError, match=r"miniswhite\.tif: says that 0 is white"):
+        read_image(tmp_path / "miniswhite.tif")
 
 
-def test_a_tiff_of_fractions_that_says_that_0_is_white_is_refused(tmp_path: Path) -> None:
-    tifffile.imwrite(tmp_path / "view.tif", PIXELS.astype(np.float32), photometric="miniswhite")
-    with pytest.raises(InputError, match=r"view\.tif: says that 0 is white"):
-        read_image(tmp_path / "view.tif")
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_picture_that_is_to_be_shown_turned_is_refused(tmp_path: Path, suffix: str) -> None:
+    picture = Image.fromarray((PIXELS // 16).astype(np.uint8))
+    exif = Image.Exif()
+    for orientation in (1, 6):
+        exif[274] = orientation
+        picture.save(tmp_path / f"view{orientation}{suffix}", exif=exif)
+    assert read_image(tmp_path / f"view1{suffix}").shape == PIXELS.shape
+    with pytest.raises(InputError, match="is to be shown turned or mirrored"):
+        read_image(tmp_path / f"view6{suffix}")

@@ -150,7 +150,9 @@ def test_covariances_are_read_from_text_and_from_results(tmp_path: File) -> None
     (tmp_path / "bad.txt").write_text("1 0 0\n0 two 0\n", encoding="utf-8")
     for name in ("a.csv", "a.txt"):
         np.testing.assert_array_equal(read_covariance(tmp_path / name), wanted)
-    for name, told in (("bad.txt", "rows of numbers"), ("no.txt", "no such file")):
+    (tmp_path / "other.json").write_text("{}", encoding="utf-8")
+    bad = {"other.json": "a result is read by its name", "bad.txt": "rows of numbers", "no.txt": "no such file"}
+    for name, told in bad.items():
         with pytest.raises(InputError, match=told):
             read_covariance(tmp_path / name)
     good = ObjectQuality((), 0.0, (0.0, 0.0), (0.1,) * 3, (0.1,) * 3, None, True, "all views agree")
@@ -189,6 +191,10 @@ def test_moves_of_a_study_are_those_of_its_trusted_runs(tmp_path: File, suffix: 
     write_runs(tmp_path, columns, suffix)
     mirrored = np.tile([-1.5, 1.5, 1.5, 0, -0.1, -0.2], (9, 1))
     np.testing.assert_allclose(study_moves(tmp_path, "left", 9, 0), mirrored, atol=1e-12)
+    columns["side"] = ["", "left", None]  # not told
+    write_runs(tmp_path, columns, suffix)
+    as_it_is = np.tile([1.5, 1.5, 1.5, 0, 0.1, 0.2], (9, 1))
+    np.testing.assert_allclose(study_moves(tmp_path, "left", 9, 0), as_it_is, atol=1e-12)
     with pytest.raises(InputError, match="neither"):
         study_moves(tmp_path / "elsewhere", "left", 1, 0)
 

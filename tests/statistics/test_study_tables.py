@@ -23,6 +23,7 @@ from femoreg_torch.statistics.formats import (
     latex,
     markdown,
     number,
+    of_paper,
     plus_minus,
     write_tables,
 )
@@ -106,13 +107,14 @@ def test_table_1_tells_absolute_errors_of_each_axis_and_the_paper_below() -> Non
     rows = made_up(4)
     rows["femur_mm_is"] = [-1.0, 1.0, 3.0, -3.0]
     table = pose_table(rows)
-    lines = {(first, what): cells for first, _, what, *cells in table.rows if first == "femur"}
+    lines = {(first, what): cells for first, what, _, *cells in table.rows if first == "femur"}
     assert lines["femur", "mean ± SD"][0] == "2.00 ± 1.15"
     after = table.rows.index(next(row for row in table.rows if row[0] == "femur"))
-    assert table.rows[after + 1][:4] == ("", "", "median", "2.00")
-    assert table.rows[after + 2][:4] == ("", "", "paper, mean ± SD", "0.14 ± 0.15")
+    assert table.rows[after + 1][:4] == ("", "median", "", "2.00")
+    assert table.rows[after + 2][:4] == ("", "paper, mean ± SD", "", "0.14 ± 0.15")
     assert table.rows[after + 3][-1] == "0.71"
     assert len(table.rows) == 5 * 4
+    assert [of_paper(row) for row in table.rows] == [False, False, True, True] * 5
 
 
 def test_a_refused_run_is_counted_where_a_number_can_hold_it() -> None:

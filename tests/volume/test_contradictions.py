@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from femoreg_torch.volume import Volume, axis_aligned, misplaced_labels, wrong_hounsfield
+from femoreg_torch.volume import Volume, axis_aligned, densities, misplaced_labels
 
 IDS = (1, 2)
 
@@ -24,13 +24,18 @@ def ct_and_labels(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> tupl
     return Volume(hu, affine), Volume(labels, affine)
 
 
+def unasked(ct: Volume, labels: Volume) -> bool:
+    found = densities(ct, labels)
+    return found.unscaled is None and found.light is None
+
+
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 3.0), (3.0, 3.0, 3.0)])
 def test_what_belongs_together_is_not_doubted(spacing: tuple[float, float, float]) -> None:
     ct, labels = ct_and_labels(spacing)
-    assert wrong_hounsfield(ct, labels) is None
+    assert unasked(ct, labels)
     assert misplaced_labels(ct, labels, IDS) is None
     bare = ct.with_data(torch.where(labels.data > 0, ct.data, torch.tensor(-1000.0)))  # bones in air, as of a dry femur
-    assert wrong_hounsfield(bare, labels) is None
+    assert unasked(bare, labels)
     assert misplaced_labels(bare, labels, IDS) is None
 
 
@@ -38,14 +43,22 @@ def test_bones_of_foam_with_a_hard_shell_are_not_doubted() -> None:
     """As those that are drilled in courses, in air."""
     ct, labels = ct_and_labels()
     foam = torch.where(labels.data > 0, torch.where(ct.data > 500, ct.data, -800.0), -1000.0)
-    assert wrong_hounsfield(ct.with_data(foam), labels) is None
+    assert unasked(ct.with_data(foam), labels)
     assert misplaced_labels(ct.with_data(foam), labels, IDS) is None
 
 
-@pytest.mark.parametrize(("offset", "told"), [(-1024.0, "applied twice"), (1024.0, "is the rescale of the scanner")])
-def test_an_intercept_that_is_missing_or_there_twice_is_told(offset: float, told: str) -> None:
+def test_an_intercept_that_is_missing_or_there_twice_is_told() -> None:
     ct, labels = ct_and_labels()
-    assert told in str(wrong_hounsfield(ct.with_data(ct.data + offset), labels))
+    missing, twice = (densities(ct.with_data(ct.data + offset), labels) for offset in (1024, -1024))
+    assert "is the rescale of the scanner" in str(missing.unscaled)
+    assert missing.light is None
+    assert "applied twice" in str(twice.light)
+    assert twice.unscaled is None
+
+
+def test_a_ct_without_bright_bone_tells_nothing_of_its_labels_place() -> None:
+    ct, labels = ct_and_labels()
+    assert misplaced_labels(ct.with_data(ct.data.clamp_max(100)), labels, IDS) is None
 
 
 @pytest.mark.parametrize("shift", [(4, 0, 0), (0, -8, 0), (3, 3, -11)])
