@@ -26,8 +26,8 @@ def pose_table(rows: pd.DataFrame) -> Table:
     axes = [axis.upper() for axis in AXES]
     columns = (
         "",
-        "runs in mean",
         "",
+        "runs in mean",
         *(f"{axis} mm" for axis in axes),
         "total mm",
         *(f"{axis} °" for axis in axes),

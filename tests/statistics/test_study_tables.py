@@ -114,6 +114,8 @@ def test_table_1_tells_absolute_errors_of_each_axis_and_the_paper_below() -> Non
     assert table.rows[after + 2][:4] == ("", "paper, mean ± SD", "", "0.14 ± 0.15")
     assert table.rows[after + 3][-1] == "0.71"
     assert len(table.rows) == 5 * 4
+    assert table.texts == 2
+    assert table.columns[2] == "runs in mean"
     assert [of_paper(row) for row in table.rows] == [False, False, True, True] * 5
 
 
