@@ -88,8 +88,13 @@ class LoadSettings:
     cap_mm: float
 
     def __post_init__(self) -> None:
-        _within("load", 90, adduction_deg=self.adduction_deg, internal_rotation_deg=self.internal_rotation_deg)
-        _within("load", 90, stance_deg=self.stance_deg)
+        _within(
+            "load",
+            90,
+            adduction_deg=self.adduction_deg,
+            internal_rotation_deg=self.internal_rotation_deg,
+            stance_deg=self.stance_deg,
+        )
         _not_negative("load", cap_mm=self.cap_mm)
         _positive(
             "load",

@@ -25,10 +25,10 @@ steps:
 def test_the_pelvis_comes_back(case: Path, tmp_path: Path) -> None:
     """The image is drawn from the CT itself, all that is bone in it, on pixels eight times as large as the C-arm's."""
     camera = load_carm("cios_fusion").camera.downsampled(8)
-    ct = read_ct(case / "ct.nii.gz")
+    ct = resample_isotropic(read_ct(case / "ct.nii.gz"), 1.0)  # as what is registered: first, and then bone is told
     bone = ct.with_data(hu_to_attenuation(ct.data.float().where(ct.data > 300, torch.tensor(-1000.0)), -1000.0))
     finer = load_carm("cios_fusion").camera.downsampled(2)
-    image = downsample(project([resample_isotropic(bone, 1.0)], TRUTH[None, None], finer, 0.3)[0], 4)
+    image = downsample(project([bone], TRUTH[None, None], finer, 0.3)[0], 4)
     none = torch.zeros(0)
     labelled = LabelledImage("boxes", image, camera, none, none, none > 0, none, TRUTH)
     middle = TRUTH[:3, 3]
@@ -39,5 +39,5 @@ def test_the_pelvis_comes_back(case: Path, tmp_path: Path) -> None:
     found = single_view_registration(case, str(preset))(labelled, shift @ about_point(turn, middle) @ TRUTH)
     assert torch.rad2deg(rotation_angle(TRUTH[:3, :3].mT @ found[:3, :3])) < 0.3
     off = (transform_points(found, torch.zeros(1, 3).double()) - middle)[0]
-    assert off[:2].norm() < 1.5  # of 5; pixels have 1.55 mm, and processors round differently
+    assert off[:2].norm() < 1  # of 5
     assert off[2].abs() < 5  # one view hardly tells the depth
