@@ -6,20 +6,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import network_camera
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import clear_leftovers
 from femoreg_torch.geometry import load_carm
 from femoreg_torch.settings import SEEDS, check_within
 from femoreg_torch.tensors import read_metadata
-from femoreg_torch.volume import read_ct, read_labels, read_landmarks
+from femoreg_torch.text import json_content
 from sim.labelled.attenuation_layers import Layers, deform, smooth_displacement, split_layers
 from sim.labelled.layer_landmarks import landmarks_by_rule
+from sim.labelled.patient_folders import PatientFiles, find_patient, hip_labels, read_patient
 from sim.labelled.training_views import write_views
 from sim.labelled.view_poses import ViewRanges
 from sim.patient import make_patient
@@ -61,6 +61,17 @@ class CohortSettings:
 
 
 @dataclass(frozen=True)
+class Source:
+    """One patient to be rendered: who it is in messages and in the cache, and how it is made."""
+
+    name: str
+    file: str  # what its files in the cache are called, but for the variant
+    told: dict[str, str]  # in the metadata of these files, beside the settings
+    variants: int
+    load: Callable[[], Layers]
+
+
+@dataclass(frozen=True)
 class Cohort:
     """Files of labelled views, and one of device shadows if any were asked for."""
 
@@ -74,22 +85,19 @@ def render_cohort(
 ) -> Cohort:
     """The views to train on and to validate on, rendered into `cache` unless they are there.
 
-    `cases` are folders with ct.nii.gz, labels.nii.gz and landmarks.json. Raises `InputError` if the cache holds views
-    made with other settings.
+    `cases` are folders as `sim.labelled.patient_folders` reads them; those whose files have changed since are rendered
+    anew. Raises `InputError` if two of them have one name, or the cache holds views made with other settings.
     """
+    _check_names(cases)
+    given = [_of_case(case, settings, report) for case in cases]  # complains before anything is rendered
     cache.mkdir(parents=True, exist_ok=True)
     clear_leftovers(cache)
     training: list[Path] = []
-    for case in cases:
-        name = case.resolve().name
-        training += _variants(settings, cache, name, settings.case_variants, partial(_read_case, case), report)
-    for seed in settings.patient_seeds:
-        make = partial(_make_patient, seed, settings.patient_spacing_mm)
-        training += _variants(settings, cache, f"patient{seed}", settings.patient_variants, make, report)
+    for source in [*given, *(_procedural(seed, settings) for seed in settings.patient_seeds)]:
+        training += _variants(settings, cache, source, report)
     validation: list[Path] = []
     for seed in settings.validation_seeds:
-        make = partial(_make_patient, seed, settings.patient_spacing_mm)
-        validation += _variants(settings, cache, f"patient{seed}", settings.patient_variants, make, report)
+        validation += _variants(settings, cache, _procedural(seed, settings), report)
     devices = None
     if settings.devices:
         camera = network_camera(load_carm(settings.carm).camera)
@@ -97,16 +105,39 @@ def render_cohort(
     return Cohort(training, validation, devices)
 
 
-def _read_case(folder: Path) -> Layers:
-    ct = read_ct(folder / "ct.nii.gz")
-    labels = read_labels(folder / "labels.nii.gz", ct)
-    landmarks = read_landmarks(folder / "landmarks.json")
-    if missing := [name for name in HIP.landmark_names if name not in landmarks]:
-        raise InputError(
-            f"{folder / 'landmarks.json'}: to train, all {len(HIP.landmarks)} landmarks are needed, {len(missing)} are "
-            f"missing: {', '.join(missing)}."
-        )
-    return split_layers(ct, labels, landmarks)
+def _check_names(cases: Sequence[Path]) -> None:
+    """Raises `InputError` for two folders of one name, by which their views are told apart."""
+    known: dict[str, Path] = {}
+    for case in cases:
+        name = case.resolve().name
+        if name in known:
+            raise InputError(
+                f"--cases: {known[name]} and {case} have one name, {shortened(name)}, by which rendered views are told "
+                "apart. Rename one of the folders, or give it once."
+            )
+        known[name] = case
+
+
+def _of_case(folder: Path, settings: CohortSettings, report: Callable[[str], None]) -> Source:
+    files, name = find_patient(folder), folder.resolve().name
+    told = {"case": name, "files": files.fingerprint()}
+    return Source(name, f"case_{name}", told, settings.case_variants, partial(_read_case, name, files, report))
+
+
+def _procedural(seed: int, settings: CohortSettings) -> Source:
+    name = f"patient{seed}"
+    make = partial(_make_patient, seed, settings.patient_spacing_mm)
+    return Source(name, name, {"patient": name}, settings.patient_variants, make)
+
+
+def _read_case(name: str, files: PatientFiles, report: Callable[[str], None]) -> Layers:
+    patient = read_patient(files)
+    for note in patient.bones.notes:
+        report(f"{name}: {note}")
+    try:
+        return split_layers(patient.ct, hip_labels(patient.bones), patient.landmarks)
+    except InputError as error:
+        raise InputError(f"{files.folder}: {error}") from error
 
 
 def _make_patient(seed: int, spacing_mm: float) -> Layers:
@@ -114,38 +145,36 @@ def _make_patient(seed: int, spacing_mm: float) -> Layers:
     return split_layers(patient.ct, patient.labels, patient.landmarks)
 
 
-def _variants(
-    settings: CohortSettings,
-    cache: Path,
-    name: str,
-    count: int,
-    load: Callable[[], Layers],
-    report: Callable[[str], None],
-) -> list[Path]:
-    files = [cache / f"{name}_{variant:02d}.safetensors" for variant in range(count)]
-    how = {k: v for k, v in asdict(settings).items() if k in _RENDERED}
-    source = json.dumps({"patient": name, **how})
-    for file in files:
-        if file.exists():
-            _check_source(file, source)
-    missing = [variant for variant, file in enumerate(files) if not file.exists()]
+def _variants(settings: CohortSettings, cache: Path, source: Source, report: Callable[[str], None]) -> list[Path]:
+    """The files of all variants of one patient, rendered where they are missing or of files that have changed since."""
+    files = [cache / f"{source.file}_{variant:02d}.safetensors" for variant in range(source.variants)]
+    how = {key: value for key, value in asdict(settings).items() if key in _RENDERED}
+    written = json.dumps({**source.told, **how})
+    missing = [n for n, file in enumerate(files) if not (file.exists() and _is_of(file, source.told, how))]
     if not missing:
         return files
-    layers = load()
+    layers = source.load()
     camera = network_camera(load_carm(settings.carm).camera)
     for variant in missing:
-        rng = np.random.default_rng([settings.seed, zlib.crc32(name.encode()), variant])
+        rng = np.random.default_rng([settings.seed, zlib.crc32(source.name.encode()), variant])
         patient = deform(layers, smooth_displacement(rng, settings.deformation_mm)) if variant else layers
         if settings.landmarks == "rules":
             patient = replace(patient, landmarks=landmarks_by_rule(patient))
-        write_views(files[variant], patient, settings.ranges, camera, settings.views, rng, source)
-        report(f"rendered {settings.views} views of {name}, variant {variant + 1} of {count}")
+        again = " anew" if files[variant].exists() else ""
+        write_views(files[variant], patient, settings.ranges, camera, settings.views, rng, written)
+        report(f"rendered {settings.views} views of {source.name}{again}, variant {variant + 1} of {source.variants}")
     return files
 
 
-def _check_source(file: Path, source: str) -> None:
-    found = read_metadata(file).get("source")
-    if found != source:
+def _is_of(file: Path, told: dict[str, str], how: dict[str, Any]) -> bool:
+    """Whether cached views are of the patient as it is now. Raises `InputError` if their settings are others."""
+    found = read_metadata(file).get("source", "{}")
+    about = json_content(found, f"{file}, source")
+    expected = json.loads(json.dumps({**told, **how}))
+    if about == expected:
+        return True
+    if not isinstance(about, dict) or {key: about.get(key) for key in how} != {key: expected[key] for key in how}:
         raise InputError(
             f"{file}: rendered with other settings ({shortened(found, 300)}). Choose an empty cache folder."
         )
+    return False

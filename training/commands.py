@@ -27,7 +27,9 @@ def train(
     Args:
         settings: preset in configs/training (hip14, quick, grupp2020), or a YAML file, which may extend one.
         out: folder of this run.
-        cases: folders with ct.nii.gz, labels.nii.gz and landmarks.json to learn from, beside the procedural patients.
+        cases: '[FOLDER, …]', patients to learn from beside the procedural ones: case folders, whose case.yaml names CT,
+            label map with its table of ids, and landmarks (all 14), or folders with ct.nii.gz, labels.nii.gz (ids of
+            the table `femoreg`) and landmarks.json. No two may have one name.
         cache: folder of rendered views, to share between runs; by default OUT/cache.
         override: settings as group.key=value, for instance '[optimisation.epochs=3, cohort.views=10]'.
         start: weights (safetensors) to begin with instead of random ones.
@@ -75,9 +77,8 @@ def measure(
             files of the public DeepFluoro data set, in either layout.
         out: folder of the results.
         weights: network weights (safetensors); by default the shipped ones.
-        register: one folder per file, in the same order, with the ct.nii.gz, labels.nii.gz and landmarks.json that the
-            file was made from; every image with a start pose is then registered by the first stages of the preset
-            `fast` (seconds per image).
+        register: '[FOLDER, …]', for each file, in the same order, the folder that it was made from; every image with a
+            start pose is then registered by the first stages of the preset `fast` (seconds per image).
         altered: also count the start poses in the same images turned by 180°, with inverted grey values, and cropped
             to one hip (takes four times as long).
     """

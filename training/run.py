@@ -26,8 +26,9 @@ from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import load_network
 from femoreg_torch.detect.grid import NETWORK_SIZE
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import clear_leftovers, temporary_file, write_json
+from femoreg_torch.files import clear_leftovers, write_json
 from models.weights import SHIPPED_WEIGHTS, Weights, save_weights
+from sim.labelled.tensor_files import tensor_file
 from training.checkpoints import WholeCheckpoints, last_good_checkpoint, read_checkpoint
 from training.cohort import render_cohort
 from training.curves import draw_curves
@@ -155,7 +156,15 @@ def _check_machine(machine: Machine) -> None:
 
 def progress_bar(console: Console) -> ProgressBar:
     """Lightning's bar for a terminal; in a Jupyter notebook, where that one fails, the plain one."""
-    return TQDMProgressBar(refresh_rate=25) if console.is_jupyter else RichProgressBar(refresh_rate=25)
+    return TQDMProgressBar(refresh_rate=25) if console.is_jupyter else EpochBar(refresh_rate=25)
+
+
+class EpochBar(RichProgressBar):
+    """Lightning's bar, which would count epochs from 0, so that a run of two ended at "Epoch 1/1"."""
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        description = f"Epoch {current_epoch + 1}/{self.trainer.max_epochs}"
+        return description.ljust(len(self.validation_description))  # or the bars would jump
 
 
 def begin_with(path: Path, network: nn.Module) -> None:
@@ -194,6 +203,6 @@ def export_weights(checkpoint: Path, settings: TrainingSettings, path: Path) -> 
         "data": json.dumps(data),
         "loss": json.dumps(known["loss"]),
     }
-    with temporary_file(path) as part:
+    with tensor_file(path) as part:
         save_weights(part, weights, about)
     return path

@@ -6,31 +6,26 @@ from pathlib import Path
 
 from torch import Tensor
 
-from femoreg_torch.anatomy import HIP, label_table
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.case.femoroplasty import ANATOMY_IMAGES, PELVIS, femoral_head, femoroplasty_objects
 from femoreg_torch.case.model import Side
 from femoreg_torch.geometry import load_carm, transform_points
 from femoreg_torch.registration import Scene, load_plan, run_plan
 from femoreg_torch.registration.prepare import ct_objects
-from femoreg_torch.volume import BoneLabels, Volume, bone_labels, read_ct, read_labels, read_landmarks
+from femoreg_torch.volume import BoneLabels, Volume
+from sim.labelled.patient_folders import find_patient, read_patient
 from sim.study.capture import first_stages
 from training.labelled import LabelledImage
 from training.measure import Registration
 
 _CARM = "cios_fusion"  # of `sim.labelled.image_files`
-_LABELS = "femoreg"  # the table of the ids in its label maps
 _SIDES: tuple[Side, ...] = ("left", "right")
 
 
 def single_view_registration(folder: Path, preset: str) -> Registration:
-    """The `registration_of` the patient whose ct.nii.gz, labels.nii.gz and landmarks.json are in `folder`.
-
-    Raises `InputError` for what cannot be read.
-    """
-    ct = read_ct(folder / "ct.nii.gz")
-    labels = read_labels(folder / "labels.nii.gz", ct)
-    landmarks = read_landmarks(folder / "landmarks.json")
-    return registration_of(ct, bone_labels(labels, ct, label_table(_LABELS), HIP, landmarks), landmarks, preset)
+    """The `registration_of` the patient in `folder`, see `sim.labelled.patient_folders`. Raises `InputError`."""
+    patient = read_patient(find_patient(folder))
+    return registration_of(patient.ct, patient.bones, patient.landmarks, preset)
 
 
 def registration_of(ct: Volume, bones: BoneLabels, landmarks: Mapping[str, Tensor], preset: str) -> Registration:

@@ -46,7 +46,7 @@ class Cohort:
 
     seeds: tuple[int, ...]  # procedural patients
     spacing_mm: float  # of their CTs
-    folders: tuple[str, ...]  # with ct.nii.gz, labels.nii.gz and landmarks.json
+    folders: tuple[str, ...]  # of patients, see `sim.labelled.patient_folders`
     views: int  # of each patient
     seed: int
 

@@ -25,7 +25,6 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera, carm_from_dict, load_carm
 from femoreg_torch.tensors import check_shapes, read_metadata, read_tensors, write_tensors
 from femoreg_torch.text import json_content
@@ -34,6 +33,7 @@ from sim.labelled.devices_in_view import make_devices
 from sim.labelled.imaged_patient import ImagedPatient, read_imaged_patient
 from sim.labelled.physics_views import render_physics
 from sim.labelled.settings import LabelledSettings, load_labelled_settings
+from sim.labelled.tensor_files import tensor_file
 from sim.labelled.view_poses import FEMORAL_HEADS
 from sim.physics.fluoroscopy import XrayModel
 
@@ -112,7 +112,7 @@ def render_views(
 
 
 def write_labelled_images(folder: Path, out: Path, config: str, count: int, seed: int, source: str | None) -> None:
-    """Render `count` views of the patient in `folder` (ct.nii.gz, labels.nii.gz, landmarks.json) into the file `out`.
+    """Render `count` views of the patient in `folder` (see `sim.labelled.patient_folders`) into the file `out`.
 
     `config` is a preset of `configs/simulation` or a YAML file; `source` says who it is, else the folder's name does.
     Raises `InputError` for input that does not fit.
@@ -121,9 +121,6 @@ def write_labelled_images(folder: Path, out: Path, config: str, count: int, seed
     if count < 1:
         raise InputError(f"labelled images: a count of 1 or more was expected, got {count}.")
     patient = read_imaged_patient(folder)
-    for bone in ("hip_left", "hip_right"):
-        if bone not in patient.masks:
-            raise InputError(f"{folder / 'labels.nii.gz'}: holds no voxel of {bone}.")
     write_labelled(out, render_views(patient, settings, count, seed, source or folder.resolve().name))
 
 
@@ -134,7 +131,7 @@ def write_labelled(path: Path, content: LabelledImages) -> None:
         "camera": json.dumps(asdict(content.camera)),
         "xray": json.dumps(content.xray_names),
     }
-    with temporary_file(path) as part:
+    with tensor_file(path) as part:
         write_tensors(part, {name: getattr(content, name).contiguous() for name in _TENSORS}, metadata)
 
 

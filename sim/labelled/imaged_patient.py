@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, label_table
-from femoreg_torch.volume import Volume, read_ct, read_labels, read_landmarks, resample_isotropic
+from femoreg_torch.volume import Volume, resample_isotropic
+from sim.labelled.patient_folders import find_patient, hip_labels, read_patient
 from sim.labelled.view_poses import FEMORAL_HEADS
 from sim.physics.tissue_densities import separate
 
@@ -45,9 +46,9 @@ def prepare_patient(ct: Volume, labels: Volume, landmarks: Mapping[str, Tensor])
 
 
 def read_imaged_patient(folder: Path) -> ImagedPatient:
-    """The patient of a folder with ct.nii.gz, labels.nii.gz and landmarks.json."""
-    ct = read_ct(folder / "ct.nii.gz")
-    return prepare_patient(ct, read_labels(folder / "labels.nii.gz", ct), read_landmarks(folder / "landmarks.json"))
+    """The patient of a folder, see `sim.labelled.patient_folders`. Raises `InputError`."""
+    patient = read_patient(find_patient(folder))
+    return prepare_patient(patient.ct, hip_labels(patient.bones), patient.landmarks)
 
 
 def _prolonged(volume: Volume) -> Volume:

@@ -4,6 +4,7 @@ import errno
 import json
 import logging
 import os
+import resource
 import shutil
 import threading
 from pathlib import Path
@@ -105,6 +106,22 @@ def test_a_disk_that_is_full_for_a_thread_of_logs_is_told_once(
     assert capsys.readouterr().err == f"femoreg: {tmp_path / 'out'}: No space left on device.\n"
 
 
+def test_a_cache_on_a_disk_without_room_is_told_once(
+    case: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tiny.yaml").write_text(SETTINGS, encoding="utf-8")
+    arguments = ["train", str(tmp_path / "tiny.yaml"), "--cases", f"[{case}]", "--cache", str(tmp_path / "cache")]
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    views = tmp_path / "cache" / f"case_{case.name}_00.safetensors"
+    assert capsys.readouterr().err == f"femoreg: {views}: File too large.\n"
+    assert list((tmp_path / "cache").iterdir()) == []
+
+
 def test_a_folder_whose_name_logs_cannot_hold(
     prepared: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -135,7 +152,7 @@ def test_a_case_that_lacks_a_landmark(case: Path, tmp_path: Path, capsys: pytest
     arguments = ["train", str(tmp_path / "tiny.yaml"), "--cases", f"[{tmp_path / 'case'}]"]
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
     told = capsys.readouterr().err
-    assert "1 are missing: FH-r" in told
+    assert "it lacks FH-r" in told
     assert told.count("\n") == 1
 
 

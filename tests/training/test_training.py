@@ -77,7 +77,15 @@ def test_one_batch_can_be_learned_by_heart() -> None:
     assert losses["landmarks"] < 0.15
 
 
-def test_a_run_exports_weights_that_load_and_can_be_resumed(settings: str, case: Path, tmp_path: Path) -> None:
+def usual_mode(folder: Path) -> int:
+    """Of a new file, by the umask."""
+    (folder / "new").touch()
+    return (folder / "new").stat().st_mode & 0o777
+
+
+def test_a_run_exports_weights_that_load_and_can_be_resumed(
+    settings: str, case: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, cache = tmp_path / "run", tmp_path / "cache"
     train(settings, out=out, cases=[case], cache=cache)
     weights = out / "hip14.safetensors"
@@ -86,6 +94,8 @@ def test_a_run_exports_weights_that_load_and_can_be_resumed(settings: str, case:
     with pytest.raises(InputError, match="holds a training run"):
         train(settings, out=out, cases=[case], cache=cache)
     train(settings, out=out, cases=[case], cache=cache, override=["optimisation.epochs=2"], resume=True)
+    assert "Epoch 2/2" in capsys.readouterr().out  # and not 1/1
+    assert {path.stat().st_mode & 0o777 for path in (weights, *cache.iterdir())} == {usual_mode(tmp_path)}
     second = load_network(weights).module.state_dict()
     assert any(not torch.equal(first[name], second[name]) for name in first)
     views = ViewBatches(sorted(cache.glob("*_??.safetensors")), 2, read_settings(settings).run.augmentation, 1, 4)
