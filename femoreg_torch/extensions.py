@@ -11,6 +11,7 @@ The class is a frozen dataclass of settings; the other keys beside `kind` are it
 import dataclasses
 from collections.abc import Mapping
 from importlib.metadata import entry_points
+from types import FunctionType
 from typing import Any, Literal
 
 from femoreg_torch.errors import InputError, shortened
@@ -46,6 +47,14 @@ def find(group: Group, kind: str, builtin: Mapping[str, Any], where: str) -> Any
         raise InputError(
             f"{where}: kind {shortened(kind)}, {others[kind].value}, cannot be imported ({error})."
         ) from error
+
+
+def name_of(group: Group, thing: Any) -> str:
+    """How a message calls an object of another package: `module:class`, after its kind if an entry point names that."""
+    named = thing if isinstance(thing, FunctionType) else type(thing)
+    value = f"{named.__module__}:{named.__qualname__}"
+    kinds = [entry.name for entry in entry_points(group=group) if entry.value == value]
+    return f"{kinds[0]} ({value})" if kinds else value
 
 
 def pop_kind(content: Any, where: str) -> tuple[str, dict[str, Any]]:

@@ -16,6 +16,7 @@ from femoreg_torch.geometry import CArm, centred_camera, rigid
 from femoreg_torch.optimize import LevenbergMarquardt, Objective, Result, Stop
 from femoreg_torch.registration import BodyPlan, Level, Plan, Scene, Stage, load_plan, run_plan
 from femoreg_torch.registration.scene import RigidObject
+from femoreg_torch.similarity import SmoothFixedSimilarity, against_field, similarity_quadratic
 from femoreg_torch.volume import Volume, axis_aligned
 
 MODULE = """
@@ -32,6 +33,24 @@ class SquaredDifferences:
 
     def against(self, fixed, weights):
         return lambda images: self.gain * (images - fixed).square().mean((1, 2))
+
+
+@dataclass(frozen=True)
+class Faulty:
+    how: str
+
+    def against(self, fixed, weights):
+        if self.how == "raises at once":
+            raise KeyError("mask")
+        faults = {
+            "raises": lambda images: {}["boom"],
+            "one number": lambda images: (images - fixed).square().mean(),
+            "one column": lambda images: (images - fixed).square().mean((1, 2))[:, None],
+            "no tensor": lambda images: [0.0] * len(images),
+            "linear": lambda images: images.sum((1, 2)),
+            "nan": lambda images: images.sum((1, 2)) * float("nan"),
+        }
+        return faults[self.how]
 
 
 @dataclass(frozen=True)
@@ -62,6 +81,7 @@ not_settings = max
 ENTRY_POINTS = """
 [femoreg_torch.similarities]
 squared_differences = mine_of_a_test:SquaredDifferences
+faulty = mine_of_a_test:Faulty
 [femoreg_torch.optimisers]
 grid = mine_of_a_test:Grid
 gone = mine_of_a_test:Gone
@@ -169,6 +189,54 @@ def test_mistakes_are_told(installed: Path, old: str, new: str, says: str) -> No
     (installed / "mine.yaml").write_text(PRESET.replace(old, new), encoding="utf-8")
     with pytest.raises(InputError, match=f"mine.yaml, step 2, .*{says}"):
         load_plan(installed / "mine.yaml")
+
+
+_EXPECTED = r"costs of shape \(\d+,\) were expected, one for each image \(B, H, W\), got"
+_WITH_SLOPES = ("linear", "its second derivative is zero, and Levenberg–Marquardt needs .*Choose an optimiser")
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("raises at once", r"raised KeyError: 'mask' \(mine_of_a_test.py, line \d+\)"),
+        ("raises", r"raised KeyError: 'boom' \(mine_of_a_test.py, line \d+\)"),
+        ("one number", rf"{_EXPECTED} \(\)"),
+        ("one column", rf"{_EXPECTED} \(\d+, 1\)"),
+        ("no tensor", f"{_EXPECTED} list"),
+        ("nan", "gave nan"),
+        _WITH_SLOPES,
+    ],
+)
+@pytest.mark.parametrize("optimiser", ["{kind: grid, steps: 9}", "{kind: levenberg_marquardt, max_iterations: 3}"])
+def test_faults_of_a_similarity_are_told_by_its_name(  # type: ignore[no-untyped-def]
+    installed: Path, scene, how: str, says: str, optimiser: str
+) -> None:
+    preset = PRESET.replace("kind: squared_differences, gain: 4", f"kind: faulty, how: {how}")
+    (installed / "mine.yaml").write_text(preset.replace("{kind: grid, steps: 9}", optimiser), encoding="utf-8")
+    plan = load_plan(installed / "mine.yaml")
+    if how == "linear" and "grid" in optimiser:
+        run_plan(scene[0], plan, None, seed=0)  # values alone it has
+        return
+    with pytest.raises(InputError, match=rf"similarity faulty \(mine_of_a_test:Faulty\): {says}"):
+        run_plan(scene[0], plan, None, seed=0)
+
+
+def test_a_similarity_with_derivatives_of_its_own_is_checked_too() -> None:
+    class Own(Differences):
+        def against(self, fixed: Tensor, weights: Tensor | None):  # type: ignore[no-untyped-def]
+            class Fixed:
+                def __call__(self, images: Tensor) -> Tensor:
+                    return images.sum((1, 2))
+
+                def quadratic(self, image: Tensor, jacobian: Tensor):  # type: ignore[no-untyped-def]
+                    return 1.0, jacobian.new_zeros(1, jacobian.shape[-1]), jacobian.new_zeros(2, 2)
+
+            return Fixed()
+
+    prepared = against_field(Own(), torch.ones(6, 7), None, None)
+    assert isinstance(prepared, SmoothFixedSimilarity)
+    with pytest.raises(InputError, match=r"Own: second derivatives of shape \(3, 3\) were expected"):
+        similarity_quadratic(prepared, torch.ones(6, 7), torch.ones(6, 7, 3))
 
 
 def test_without_that_package_its_kinds_are_unknown(tmp_path: Path) -> None:

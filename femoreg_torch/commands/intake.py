@@ -74,7 +74,8 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
         count = len(found.problems)
         console.print(f"[bold red]{count} problem{'s' * (count > 1)}.[/] Mend all and check again.")
         return AMISS
-    console.print("[green]Nothing is wrong that can be seen before the registration.[/]")
+    beside = ", but for what is warned of" if found.warnings else ""
+    console.print(f"[green]Nothing is wrong that can be seen before the registration{beside}.[/]")
     return DONE
 
 

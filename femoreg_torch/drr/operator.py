@@ -1,8 +1,10 @@
 """The one public projector: line integrals through posed volumes, differentiable, on whichever back end fits."""
 
 import functools
+import math
 import warnings
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -16,12 +18,20 @@ from femoreg_torch.drr.bricks import bricked
 from femoreg_torch.drr.moments import affine_gradient, offset_gradient, unit_rays
 from femoreg_torch.drr.reference import march
 from femoreg_torch.drr.sampling import middle_index, middle_of, offset_rates, offsets_of
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, in_mm, shortened
 from femoreg_torch.geometry.camera import Camera
 from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.volume.grid import Volume
 
 Array = NDArray[np.float64]
+
+# Samples along the diagonal of a volume: several hundred per voxel of the largest CTs. One image of a million takes
+# minutes, and more are a step or an affine in the wrong unit.
+_MOST_SAMPLES = 1e6
+# Voxels per mm, and voxels from the source to the first one, to which float64 still tells a thousandth of a voxel. The
+# inverse of a pose that is singular, or lies out of this world, has more, or nan.
+_MOST_VOXELS = 1e12
+_LAST_ROW, _ROUNDING = np.array([0.0, 0.0, 0.0, 1.0]), 1e-4  # poses may be float16
 
 
 def project(
@@ -44,16 +54,24 @@ def project(
     on the device of the volumes: numba's on the CPU, Triton's on CUDA. Poses may lie there or on the CPU: neither waits
     for the device. Where Triton cannot (`cuda.why_not` tells), the slow plain-torch march steps in, with
     a warning that says why. A sub-window or a coarser grid is a matter of the camera (`Camera.window`,
-    `Camera.downsampled`). Raises `InputError` where shapes or devices do not fit, and for poses that are not finite;
-    poses on CUDA give an image of nan then, where to look at them would mean to wait.
+    `Camera.downsampled`).
+
+    The derivative is of first order: the image cannot be differentiated twice, and `torch.func.grad`, `jacrev`,
+    `jacfwd` and `vmap` do not go through it; `project_with_jacobian` gives all derivatives by a pose at once. Images
+    are float32 whatever comes in, so a check by finite differences needs steps of some 1e-3 rad and mm.
+
+    Raises `InputError` where shapes or devices do not fit, for a step that is not positive or so short that a ray takes
+    more than a million samples through a volume, and for poses that are not finite, singular, or not affine (last row
+    0, 0, 0, 1). Poses on CUDA of a volume there give an image of nan instead, where to look at them would mean to wait.
     """
     if isinstance(volumes, Volume):
-        if camera_from_volume.shape[1:] != (4, 4):
+        _check_tensor(camera_from_volume)
+        if camera_from_volume.ndim != 3 or camera_from_volume.shape[1:] != (4, 4):
             raise InputError(
                 f"project: one volume needs poses of shape (B, 4, 4), got {tuple(camera_from_volume.shape)}."
             )
         volumes, camera_from_volume = [volumes], camera_from_volume[:, None]
-    _check(volumes, camera_from_volume)
+    _check(volumes, camera_from_volume, camera, step_mm)
     images = [_project_one(volume, camera_from_volume[:, v], camera, step_mm) for v, volume in enumerate(volumes)]
     if separate:
         return torch.stack(images, 1)
@@ -75,11 +93,18 @@ def project_with_jacobian(
     (rotation in rad, translation in mm), taken at zero. With `intrinsics`, three more columns (B, H, W, 9) are the
     derivatives by the intrinsics: the logarithm of the source distance, and the principal point along x and y in mm on
     the detector. In memory the derivatives lie image by image, not pixel by pixel. `camera_from_volume` is (B, 4, 4).
-    On the CPU, or on CUDA with Triton; raises `InputError` where it cannot.
+    On the CPU, or on CUDA with Triton; raises `InputError` where it cannot, and as `project` does.
     """
-    _check([volume], camera_from_volume[:, None])
+    _check_tensor(camera_from_volume)
+    if camera_from_volume.ndim != 3:
+        raise InputError(
+            f"project_with_jacobian: poses of shape (B, 4, 4) are needed, got {tuple(camera_from_volume.shape)}."
+        )
+    _check([volume], camera_from_volume[:, None], camera, step_mm)
+    if centre.shape != (3,):
+        raise InputError(f"project_with_jacobian: a centre of shape (3,) is needed, got {tuple(centre.shape)}.")
     with torch.no_grad():
-        index_from_camera = _index_from_camera(volume, camera_from_volume)
+        index_from_camera = _index_from_camera(volume, camera_from_volume, step_mm)
         affines = index_from_camera[:, :3]
         middle = middle_of(volume, camera_from_volume)
         generators = _twist_generators(centre.to(index_from_camera))
@@ -111,6 +136,7 @@ def _with_derivatives(
     Samples stay whole steps beyond `offsets` (B,) mm, which change by `rates` (B, n).
     """
     if volume.data.device.type == "cpu":
+        _check_inverse(affines.numpy())
         numbers = affines.numpy(), camera, offsets.numpy(), step_mm
         integrals, moments = cpu.projection_with_moments(bricked(volume), *numbers)
         slides = rates[:, :, None, None] * affines[:, None, :, :3]
@@ -148,7 +174,24 @@ def _ray_generators(camera: Camera) -> Tensor:
     return generators
 
 
-def _check(volumes: Sequence[Volume], camera_from_volume: Tensor) -> None:
+def _check_tensor(camera_from_volume: Tensor) -> None:
+    if not isinstance(camera_from_volume, Tensor):
+        found = type(camera_from_volume).__name__
+        raise InputError(f"project: poses must be a torch tensor, got {found}. Use torch.as_tensor.")
+    if camera_from_volume.is_complex():
+        raise InputError("project: poses must be real, got complex numbers.")
+
+
+def _check(volumes: Sequence[Volume], camera_from_volume: Tensor, camera: Camera, step_mm: float) -> None:
+    _check_tensor(camera_from_volume)
+    if not isinstance(volumes, Sequence) or not all(isinstance(volume, Volume) for volume in volumes):
+        raise InputError(f"project: a Volume or a list of them is needed, got {type(volumes).__name__}.")
+    if not volumes:
+        raise InputError("project: there is no volume to project, the list is empty.")
+    if not isinstance(camera, Camera):
+        raise InputError(f"project: a Camera is needed, got {type(camera).__name__}.")
+    if not isinstance(step_mm, float | Real) or not 0 < step_mm < math.inf:
+        raise InputError(f"project: step_mm must be positive and finite, got {shortened(step_mm)}.")
     if camera_from_volume.ndim != 4 or camera_from_volume.shape[1:] != (len(volumes), 4, 4):
         raise InputError(
             f"project: {len(volumes)} volumes need poses of shape (B, {len(volumes)}, 4, 4), "
@@ -156,17 +199,50 @@ def _check(volumes: Sequence[Volume], camera_from_volume: Tensor) -> None:
         )
     if len({volume.data.device for volume in volumes}) > 1:
         raise InputError("project: the volumes lie on different devices. Move them to one.")
-    if camera_from_volume.device.type == "cpu" and not torch.isfinite(camera_from_volume).all():
-        raise InputError("project: a pose holds values that are not finite.")
+    if camera_from_volume.device.type == "cpu":
+        poses = camera_from_volume.detach().to(torch.float64).numpy()
+        if not np.isfinite(poses).all():
+            raise InputError("project: a pose holds values that are not finite.")
+        last = poses[..., 3, :]
+        if not (last == _LAST_ROW).all() and not (np.abs(last - _LAST_ROW) <= _ROUNDING).all():
+            raise InputError("project: the last row of a pose must be 0, 0, 0, 1.")
 
 
-def _index_from_camera(volume: Volume, camera_from_volume: Tensor) -> Tensor:
+def _check_samples(volume: Volume, camera_from_index: Array, step_mm: float) -> None:
+    """Raise `InputError` if rays take too many samples through a volume; of (B, 4, 4) linear parts (3, 3) count.
+
+    The box of a volume, in mm along the axes of the camera, is as long as the sum of its edges there.
+    """
+    depth, height, width = volume.data.shape
+    along = np.abs(camera_from_index[:, :3, :3]) @ (width + 1.0, height + 1.0, depth + 1.0)  # (B, 3)
+    longest = float(along.max(initial=0.0))
+    if longest > _MOST_SAMPLES * step_mm:
+        raise InputError(
+            f"project: a ray takes {longest / step_mm:.2g} samples through a volume of {in_mm(longest)} at step_mm = "
+            f"{step_mm:g}; {_MOST_SAMPLES:g} are the limit. Take longer steps, and give affines in mm."
+        )
+
+
+def _check_inverse(index_from_camera: Array) -> None:
+    """Raise `InputError` for affines (B, 3, 4) that the CPU's kernels cannot follow. They would read anywhere."""
+    if not (np.abs(index_from_camera) <= _MOST_VOXELS).all():
+        raise InputError(
+            "project: a pose is not finite, has no inverse, or puts its volume out of reach. Give rigid poses in mm."
+        )
+
+
+def _index_from_camera(volume: Volume, camera_from_volume: Tensor, step_mm: float) -> Tensor:
     """(B, 4, 4) float64 from mm in the camera frame to (x, y, z) indices, where the poses are."""
     device = camera_from_volume.device
     lps_from_index = volume.lps_from_index.to(device, non_blocking=True)
     camera_from_index = camera_from_volume.to(torch.float64) @ lps_from_index
-    # To check for singular matrices means to wait for the device, so that only the CPU does.
-    return torch.linalg.inv_ex(camera_from_index, check_errors=device.type == "cpu").inverse
+    inverse, fault = torch.linalg.inv_ex(camera_from_index)
+    # To look at what lies on a device means to wait for it: there a rigid pose is taken for granted.
+    on_cpu = device.type == "cpu"
+    _check_samples(volume, (camera_from_index.detach() if on_cpu else volume.lps_from_index[None]).numpy(), step_mm)
+    if on_cpu and fault.numpy().any():
+        raise InputError("project: a pose has no inverse. Give rigid poses in mm.")
+    return inverse
 
 
 def _project_one(volume: Volume, camera_from_volume: Tensor, camera: Camera, step_mm: float) -> Tensor:
@@ -175,11 +251,12 @@ def _project_one(volume: Volume, camera_from_volume: Tensor, camera: Camera, ste
     if on_cpu and not wanted and camera_from_volume.device.type == "cpu":
         placed, first = _numbers_of(volume, camera_from_volume.detach().numpy(), step_mm)
         return torch.from_numpy(cpu.projection(bricked(volume), placed, camera, first, step_mm))
-    index_from_camera = _index_from_camera(volume, camera_from_volume)
+    index_from_camera = _index_from_camera(volume, camera_from_volume, step_mm)
     index_from_camera = index_from_camera.to(volume.data.device, non_blocking=True)
     offsets = offsets_of(middle_of(volume, camera_from_volume), step_mm).to(volume.data.device, non_blocking=True)
     affines = index_from_camera[:, :3]
     if on_cpu:
+        _check_inverse(affines.detach().numpy())
         image: Tensor = _CpuProjection.apply(volume.data, affines, offsets, volume, camera, step_mm)
         return image
     if reason := cuda.why_not(volume):
@@ -194,8 +271,14 @@ def _numbers_of(volume: Volume, poses: Array, step_mm: float) -> tuple[Array, Ar
     In numpy, because torch's calls take longer, by a twentieth of the time of a small image.
     """
     camera_from_index = poses.astype(np.float64) @ volume.lps_from_index.numpy()
+    _check_samples(volume, camera_from_index, step_mm)
     middles = (camera_from_index @ middle_index(volume))[:, :3]
-    return np.linalg.inv(camera_from_index)[:, :3], np.linalg.norm(middles, axis=-1) % step_mm
+    try:
+        affines = np.linalg.inv(camera_from_index)[:, :3]
+    except np.linalg.LinAlgError as error:
+        raise InputError("project: a pose has no inverse. Give rigid poses in mm.") from error
+    _check_inverse(affines)
+    return affines, np.linalg.norm(middles, axis=-1) % step_mm
 
 
 @functools.cache

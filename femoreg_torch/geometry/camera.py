@@ -5,12 +5,19 @@ OpenCV), mm. The centre of the first pixel is at (column, row) = (0, 0).
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import index
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
+
+# Far beyond any detector (a beam that is nearly parallel has a source 1e6 mm away), and safe to square in float64.
+_LARGEST = {"sdd_mm": 1e9, "pixel_mm": 1e6, "principal_point_px": 1e9}
+_SMALLEST_MM = 1e-6
 
 
 @dataclass(frozen=True)
@@ -28,7 +35,11 @@ class CameraChange:
 
 @dataclass(frozen=True)
 class Camera:
-    """Intrinsics of one detector (or of a window or coarser grid on it)."""
+    """Intrinsics of one detector (or of a window or coarser grid on it).
+
+    Raises `InputError` for lengths that are not positive, for values that are not finite, or of an order of magnitude
+    that no detector has, and for a shape that is not two whole numbers.
+    """
 
     sdd_mm: float  # source to detector
     pixel_mm: tuple[float, float]  # row spacing, column spacing
@@ -36,8 +47,16 @@ class Camera:
     principal_point_px: tuple[float, float]  # column, row where the central ray meets the detector
 
     def __post_init__(self) -> None:
+        for pair in ("pixel_mm", "shape", "principal_point_px"):
+            if len(getattr(self, pair)) != 2:
+                raise InputError(f"camera: {pair} must be two numbers, got {shortened(getattr(self, pair))}.")
+        if not all(_is_whole(n) for n in self.shape):
+            raise InputError(f"camera: shape must be two whole numbers, rows and columns, got {shortened(self.shape)}.")
         if not self.sdd_mm > 0 or not min(self.pixel_mm) > 0 or min(self.shape) < 1:
             raise InputError(f"camera: source distance, pixel size and shape must be positive, got {self}.")
+        _check_size("sdd_mm", (self.sdd_mm,), _SMALLEST_MM)
+        _check_size("pixel_mm", self.pixel_mm, _SMALLEST_MM)
+        _check_size("principal_point_px", self.principal_point_px, 0)
 
     @property
     def mean_pixel_mm(self) -> float:
@@ -57,8 +76,15 @@ class Camera:
     def downsampled(self, factor: int) -> "Camera":
         """The camera of an image averaged over `factor` × `factor` blocks: c' = (c + 0.5) / factor − 0.5.
 
-        Rows and columns that fill no whole block at the far edge are dropped, as the average drops them.
+        Rows and columns that fill no whole block at the far edge are dropped, as the average drops them. Raises
+        `InputError` for a factor that is no whole number from 1 on, or of which no block fits.
         """
+        if not _is_whole(factor) or factor < 1:
+            raise InputError(
+                f"camera: blocks of a whole number of pixels were expected, 1 or more, got {shortened(factor)}."
+            )
+        if factor > min(self.shape):
+            raise InputError(f"camera: no block of {factor} × {factor} pixels fits on a {self.shape} detector.")
         rows, columns = self.shape
         return replace(
             self,
@@ -114,6 +140,22 @@ class Camera:
         x = (columns - self.principal_point_px[0]) * self.pixel_mm[1]
         grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
         return torch.stack([grid_x, grid_y, torch.full_like(grid_x, self.sdd_mm)], -1)
+
+
+def _is_whole(number: Any) -> bool:
+    """Whether a number counts something: an int, or NumPy's."""
+    try:
+        index(number)
+    except TypeError:
+        return False
+    return not isinstance(number, bool)
+
+
+def _check_size(name: str, values: Sequence[float], smallest: float) -> None:
+    """Raise `InputError` for numbers whose size is not between `smallest` and what is plausible; nan is neither."""
+    for value in values:
+        if not smallest <= abs(value) <= _LARGEST[name]:
+            raise InputError(f"camera: {name} must be finite, {smallest:g} to {_LARGEST[name]:g} in size, got {value}.")
 
 
 def centred_camera(sdd_mm: float, pixel_mm: tuple[float, float], shape: tuple[int, int]) -> Camera:

@@ -31,6 +31,7 @@ from femoreg_torch.intake.check_anatomy import (
     SeenAnatomy,
     check_bones,
     check_ct,
+    check_head,
     check_landmarks,
     check_path,
     planes_of,
@@ -118,6 +119,7 @@ def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAn
             found.warnings += cut_bones(
                 seen.bones.labels, seen.bones.ids, ("hip_left", "hip_right", operated_femur(side))
             )
+            check_head(side, seen, found)
         if path is not None:
             check_path(path, side, seen, found)
     if DEVICE in top:

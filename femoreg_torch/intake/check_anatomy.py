@@ -18,20 +18,28 @@ from femoreg_torch.intake.found import Found
 from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.pnp import MINIMUM
+from femoreg_torch.segment import head_centre
 from femoreg_torch.volume import (
     BoneLabels,
     Volume,
     bone_labels,
     check_inside,
     densities,
+    has_names,
+    landmarks_beside_bones,
+    landmarks_without_bones,
     merged_bones,
     misplaced_labels,
     read_ct_told,
     read_labels_told,
+    segment_names,
     stray_landmarks,
     swapped_sides,
 )
-from femoreg_torch.volume.bones import nearest_label
+from femoreg_torch.volume.bones import nearest_voxel
+
+_MOST_BESIDE_MM = 5.0  # of an entry point beside its femur, and of a femoral head from the sphere that fits it
+_MOST_NAMES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +77,8 @@ def check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: Found) -
 def check_bones(
     path: Path, ct: Volume, table: LabelTable, anatomy: Anatomy | None, marks: Mapping[str, Tensor], found: Found
 ) -> BoneLabels:
-    labels, told = read_labels_told(path, ct, {n for ids in table.values() for n in ids})
+    wanted = {n for ids in table.values() for n in ids}
+    labels, told = read_labels_told(path, ct, wanted)
     found.warnings += [*told, *(f"{path.name}: {warning}" for warning in header_warnings(path))]
     bones = bone_labels(labels, ct, table, anatomy, marks)
     seen = densities(ct, bones.labels)
@@ -80,12 +89,21 @@ def check_bones(
     elif (misplaced := misplaced_labels(ct, bones.labels, list(bones.ids.values()))) is not None:
         found.warnings.append(misplaced)
     found.facts.append(f"bones: {', '.join(bones.ids)}")
+    names = [name for name, ids in segment_names(path).items() if not wanted & set(ids)] if has_names(path) else []
+    if names:
+        found.facts.append(f"parts of {path.name} that are taken for no bone: {some_of(names)}")
     for bone, ids in bones.absent.items():
         numbers = ", ".join(map(str, ids))
         found.warnings.append(
             f"no voxel of {path.name} carries the label {numbers}, the {bone}: nothing is lost if the CT shows none"
         )
     return bones
+
+
+def some_of(names: list[str]) -> str:
+    """The first few of many names."""
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(names[:_MOST_NAMES]) + more
 
 
 def check_landmarks(seen: SeenAnatomy, found: Found) -> None:
@@ -108,6 +126,24 @@ def check_landmarks(seen: SeenAnatomy, found: Found) -> None:
         merged = merged_bones(seen.bones, inside, seen.anatomy)
         for told in swapped or [*stray_landmarks(seen.bones, inside, seen.anatomy), *merged]:
             found.problem(f"{told}.")
+        found.warnings += landmarks_without_bones(seen.bones, inside, seen.anatomy)
+        if not swapped:
+            found.warnings += landmarks_beside_bones(seen.bones, inside, seen.anatomy)
+
+
+def check_head(side: Side, seen: SeenAnatomy, found: Found) -> None:
+    """The operated femoral head, which paths end in, lies in the middle of the sphere that fits the bone's."""
+    name = femoral_head(side)
+    centre = None if seen.bones is None or name not in seen.landmarks else head_centre(seen.bones, side)
+    if centre is None:
+        return
+    off = float((centre - seen.landmarks[name]).norm())
+    if off > _MOST_BESIDE_MM:
+        where = ", ".join(f"{v:.1f}" for v in centre.tolist())
+        found.warnings.append(
+            f"landmarks: {name} lies {off:.0f} mm from the middle of the sphere that fits the femoral head of the "
+            f"label map, ({where}) mm LPS: look at it"
+        )
 
 
 def check_path(path: PlannedPath, side: Side, seen: SeenAnatomy, found: Found) -> None:
@@ -125,15 +161,19 @@ def check_path(path: PlannedPath, side: Side, seen: SeenAnatomy, found: Found) -
     for name, point in ends.items():
         if torch.equal(point, head):
             continue  # a landmark, which is looked at by itself
-        label = nearest_label(seen.bones.labels, list(femora), point)
+        near = nearest_voxel(seen.bones.labels, list(femora), point)
         where = ", ".join(f"{v:.1f}" for v in point.tolist())
-        if label is None:
+        if near is None:
             found.problem(
                 f"plan: the {name} ({where}) mm LPS lies near no femur of the label map. Check RAS/LPS, or move it."
             )
-        elif femora[label] != operated_femur(side):
+        elif femora[near[0]] != operated_femur(side):
             found.problem(
-                f"plan: the {name} lies on the {femora[label]}, but `side` is {side}. Correct one of the two."
+                f"plan: the {name} lies on the {femora[near[0]]}, but `side` is {side}. Correct one of the two."
+            )
+        elif near[1] > _MOST_BESIDE_MM:
+            found.warnings.append(
+                f"plan: the {name} ({where}) mm LPS lies {near[1]:.0f} mm outside the femur: look at it"
             )
 
 

@@ -22,6 +22,7 @@ from femoreg_torch.files import new_folder, plain, write_text
 from femoreg_torch.fluoro import Display, Source, carm_settings, may_be_image, nearest_side, read_header
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.check import check_case
+from femoreg_torch.intake.check_anatomy import some_of
 from femoreg_torch.intake.volumes import fitting_tables
 from femoreg_torch.segment import load_bone_network, propose_landmarks, segment_bones
 from femoreg_torch.volume import (
@@ -153,7 +154,7 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     if given.labels is None:
         bones, (labels_name, labels) = label_table(_OWN_TABLE), _segmented(folder, ct, notes)
     else:
-        bones = _bones(given)
+        bones = _bones(given, notes)
         labels_name, labels = _labels(folder, given.labels, ct, bones, notes)
     landmarks = given_landmarks or _proposed(labels, ct, bones, notes)
     side = given.side or _side(labels, ct, bones, landmarks, entry_point, notes)
@@ -225,7 +226,7 @@ def _copied(path: Path, folder: Path, stem: str) -> str:
     return name
 
 
-def _bones(given: NewCase) -> LabelTable:
+def _bones(given: NewCase, notes: list[str]) -> LabelTable:
     """Which ids of the label map are which bones."""
     assert given.labels is not None
     if given.bones is not None:
@@ -241,6 +242,8 @@ def _bones(given: NewCase) -> LabelTable:
                 f"{given.labels}: none of its parts is named after a bone; there are: {', '.join(names)[:200]}. Name "
                 f"them {', '.join(HIP.bone_names)}."
             )
+        if others := [text for text in names if bone_of_name(HIP, text) is None]:
+            notes.append(f"parts of {given.labels.name} that are taken for no bone: {some_of(others)}")
         return table
     there = [n for n in torch.unique(read_label_map(given.labels).data).tolist() if n]
     fitting = fitting_tables(there)
@@ -406,6 +409,8 @@ def _display(given: NewCase, images: list[Path], notes: list[str]) -> dict[str, 
             *([f"turned by {told.turned_deg}°"] if told.turned_deg else []),
         ]
         notes.append(f"the pictures are {' and '.join(words)}, by PatientOrientation in the header of {images[0].name}")
-    if source is None and tags is None:
-        notes.append("the source is taken to stand in front of the patient, as no --source was given")
+    if source is None:
+        notes.append(
+            "the source is taken to stand in front of the patient, as neither --source nor a header says where it is"
+        )
     return display_content(display)

@@ -67,13 +67,16 @@ def guide(result: Result) -> Guidance:
 
 
 def untold_turn(result: Result, found: Guidance) -> str | None:
-    """That no image tells the turn of a round tool about its own axis, and what that leaves open, in words; or None."""
+    """That no image tells the turn of a tool about its long axis, and what that leaves open, in words; or None.
+
+    It is round, or what is in view of it is.
+    """
     quality = result.quality.get(found.tool)
     if quality is None or quality.turn_told:
         return None
     return (
-        f"the {found.tool} is round, and no image tells its turn about its own axis: directions in its frame, or in "
-        f"the robot's base, may be turned about it; those in the frame of the {found.object} hold"
+        f"no image tells the turn of the {found.tool} about its long axis: directions in its frame, or in the robot's "
+        f"base, may be turned about it; those in the frame of the {found.object} hold"
     )
 
 

@@ -35,6 +35,7 @@ def navigation_content(result: Result, robot: Robot | None) -> dict[str, Any]:
         "tool": tool,
         "trusted": not reasons,
         "reasons": reasons,
+        "turn_told": untold is None,
         "skipped": result.skipped,
         "notice": NOTICE,
         "tip_offset_mm": found.tip_offset.norm(),
@@ -88,7 +89,10 @@ def summary(content: dict[str, Any]) -> list[str]:
     ]
     if not content["trusted"]:
         reasons = escape("; ".join(content["reasons"]))
-        lines.insert(0, f"[bold red]Do not steer by this, it is not trusted[/]: {reasons}.")
+        by = (
+            "the correction" if len(content["reasons"]) == 1 and not content["turn_told"] else "this, it is not trusted"
+        )
+        lines.insert(0, f"[bold red]Do not steer by {by}[/]: {reasons}.")
     return lines
 
 

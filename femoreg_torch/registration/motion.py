@@ -1,11 +1,12 @@
-"""Has the anatomy moved between the images without and with the device, or the device between the views?
+"""Has the anatomy moved between the images without and with the device, or a bone or the device between the views?
 
-All images are registered as if the anatomy had stayed where it was, the C-arm had come back to where it was, and the
-device had been held still. The images tell whether that holds: let the anatomy, or one of its bones, move by a rigid
-motion y in the images of another kind than the first, in all views at once (the patient moved) or in one alone (the
-C-arm did not come back), or let the device move in one view, and let everything else be refitted. With curvature and
-scores profiled as those of the intrinsics are (`registration.covariance`), the step of Newton is −S⁻¹ Σ r, and its
-covariance that of the sandwich estimator over tiles, S⁻¹ R S⁻¹.
+All images are registered as if the anatomy had stayed where it was, the C-arm had come back to where it was, the leg
+had not turned in its joint, and the device had been held still. The images tell whether that holds: let the anatomy, or
+one of its bones, move by a rigid motion y in the images of another kind than the first, in all views at once (the
+patient moved) or in one alone (the C-arm did not come back), or let the device, or a bone beside the scene's anchor,
+move in one view, and let everything else be refitted. With curvature and scores profiled as those of the intrinsics are
+(`registration.covariance`), the step of Newton is −S⁻¹ Σ r, and its covariance that of the sandwich estimator over
+tiles, S⁻¹ R S⁻¹.
 """
 
 from collections.abc import Sequence
@@ -26,7 +27,7 @@ Image = tuple[Kind, int]
 class MotionBetween:
     """How objects lie in some images of one kind, beside where they lie in all others."""
 
-    kind: Kind
+    kind: Kind | None  # None: in the images of all kinds
     views: tuple[int, ...]  # from 0, that it was looked for in, all at once
     objects: tuple[str, ...]  # that move together
     motion: Tensor  # (6,) degrees and mm, about the first object's reference point, along the axes of camera 1
@@ -69,9 +70,10 @@ def motions_between(
 def drifts_between_views(
     scene: Scene, parts: Sequence[Quadratic], images: Sequence[Image], names: Sequence[str], centres: Tensor
 ) -> tuple[MotionBetween, ...]:
-    """Motions in one view of each object that images of the first kind do not show, beside its other views.
+    """Motions in one view of each object but the anchor, beside its other views.
 
-    `parts`, `images`, `names` and `centres` are as for `motions_between`.
+    Of objects that images of the first kind show, in the view's images of all kinds. `parts`, `images`, `names` and
+    `centres` are as for `motions_between`.
     """
     found = []
     for kind in dict.fromkeys(kind for kind, _ in images if kind != scene.first_kind):
@@ -81,6 +83,13 @@ def drifts_between_views(
             for view in views if kind in shown and scene.first_kind not in shown and len(views) > 1 else ():
                 chosen = [each == (kind, view) for each in images]
                 found.append(MotionBetween(kind, (view,), (name,), *_step(parts, chosen, _moves([n], centres))))
+    views = tuple(dict.fromkeys(view for _, view in images))
+    for n, name in enumerate(names):
+        if name == scene.anchor or scene.first_kind not in scene.objects[name].shown_in:
+            continue
+        for view in views if len(views) > 1 else ():
+            chosen = [each == view for _, each in images]
+            found.append(MotionBetween(None, (view,), (name,), *_step(parts, chosen, _moves([n], centres))))
     return tuple(found)
 
 

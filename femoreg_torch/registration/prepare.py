@@ -42,6 +42,7 @@ from femoreg_torch.volume import (
     densities,
     hu_to_attenuation,
     label_box_centre,
+    landmarks_without_bones,
     merged_bones,
     read_ct_told,
     read_labels_told,
@@ -122,7 +123,7 @@ def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]
     seen = densities(ct, bones.labels)
     if wrong := [*told, *filter(None, [seen.unscaled])]:
         raise InputError(f"{case.folder}: {'; '.join(wrong)}.")
-    return tuple(filter(None, [seen.light]))
+    return (*filter(None, [seen.light]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
 
 
 def _check_path(case: Case, ct: Volume) -> None:

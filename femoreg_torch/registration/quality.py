@@ -178,12 +178,12 @@ def _assess_object(
     displacement = _displacement(scene, poses, name)
     reason = (
         _reason(name, views, limits)
+        or _unturned(name, lost_by_turning, limits)  # before what it may be the cause of
         or _unsettled(name, judged, limits)
         or _vague(name, judged.rotation, judged.translation, limits)
         or _loose(name, scene.anchor, covariance, limits)
         or _displaced(scene, name, displacement, limits)
         or _rivalled(name, trace, limits)
-        or _unturned(name, lost_by_turning, limits)
     )
     told = reason or ("all views agree" if len(views) == scene.views else "all views that show it agree")
     if reason is None and axis is not None:

@@ -2,12 +2,13 @@
 
 from femoreg_torch.segment.bones import Segmentation, segment_bones, segment_bones_without_network
 from femoreg_torch.segment.network import BoneNetwork, load_bone_network
-from femoreg_torch.segment.points import Proposal, propose_landmarks
+from femoreg_torch.segment.points import Proposal, head_centre, propose_landmarks
 
 __all__ = [
     "BoneNetwork",
     "Proposal",
     "Segmentation",
+    "head_centre",
     "load_bone_network",
     "propose_landmarks",
     "segment_bones",

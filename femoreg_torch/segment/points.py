@@ -12,7 +12,7 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
-from femoreg_torch.segment.rules import SIDES, find_surface_landmarks
+from femoreg_torch.segment.rules import SIDES, femoral_head, find_surface_landmarks
 from femoreg_torch.volume import BoneLabels, Volume
 
 _STEP_MM = 1.5  # of the grid that surfaces are drawn on; edges are then at most its diagonal
@@ -70,6 +70,17 @@ def propose_landmarks(ct: Volume, bones: BoneLabels) -> Proposal:
             residual = found.head_residual.get(side, 0.0) if landmark.name.startswith("FH") else 0.0
             errors[landmark.name] = _expected_error(landmark.spread_mm, ct.spacing_mm, residual)
     return Proposal(kept, errors, found.head_radius, found.head_residual, left_out, tuple(warnings))
+
+
+def head_centre(bones: BoneLabels, side: str) -> Tensor | None:
+    """Centre (3,), LPS mm, of the sphere that fits a femoral head; None where bones are missing or it is no sphere."""
+    names = [f"{bone}_{side}" for bone in ("femur", "hip")]
+    if not set(names) <= set(bones.ids):
+        return None
+    sphere, residual = femoral_head(*(bone_surface(bones.labels, bones.ids[name]) for name in names))
+    if not _HEAD_RADIUS_MM[0] <= sphere[3] <= _HEAD_RADIUS_MM[1] or residual > _DOUBTED_RESIDUAL_MM:
+        return None
+    return torch.from_numpy(sphere[:3].copy())
 
 
 def bone_surface(labels: Volume, number: int) -> trimesh.Trimesh:

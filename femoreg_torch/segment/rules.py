@@ -55,7 +55,7 @@ def find_surface_landmarks(bones: Surfaces, whole: bool = True, edge_mm: float =
     """
     hips = {side: bones[f"hip_{side}"] for side in SIDES if whole or f"hip_{side}" in bones}
     femora = {side: bones[f"femur_{side}"] for side in hips if whole or f"femur_{side}" in bones}
-    spheres = {side: _femoral_head(femur, hips[side]) for side, femur in femora.items()}
+    spheres = {side: femoral_head(femur, hips[side]) for side, femur in femora.items()}
     heads = {side: sphere[:3] for side, (sphere, _) in spheres.items()}
     frame, middle, asis = _pelvic_frame(hips, heads)
     found: dict[str, Points] = {f"FH-{side[0]}": head for side, head in heads.items()}
@@ -84,7 +84,7 @@ def find_surface_landmarks(bones: Surfaces, whole: bool = True, edge_mm: float =
     )
 
 
-def _femoral_head(femur: trimesh.Trimesh, hip: trimesh.Trimesh) -> tuple[Points, float]:
+def femoral_head(femur: trimesh.Trimesh, hip: trimesh.Trimesh) -> tuple[Points, float]:
     """Centre and radius (4,): fitted to the vertices next to the hip bone, then again to those near the sphere.
 
     Also the root mean square distance from it of the vertices next to the hip bone.

@@ -6,7 +6,6 @@ from femoreg_torch.similarity.interface import (
     FixedSimilarity,
     Similarity,
     SmoothFixedSimilarity,
-    against_field,
 )
 from femoreg_torch.similarity.kernels import derivative_taps, image_gradients
 from femoreg_torch.similarity.kinds import read_similarity
@@ -14,6 +13,7 @@ from femoreg_torch.similarity.ncc import Ncc
 from femoreg_torch.similarity.orientation import GradientOrientation
 from femoreg_torch.similarity.quadratic import similarity_quadratic, similarity_quadratics
 from femoreg_torch.similarity.shift import shift_correlation
+from femoreg_torch.similarity.watched import against_field
 
 __all__ = [
     "FieldSimilarity",

@@ -1,8 +1,18 @@
 """What a similarity refuses to compare."""
 
+from operator import index
+
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
+
+
+def check_whole(patch_radius: int | None) -> None:
+    """Raise `InputError` for a radius of patches that is no whole number; None passes."""
+    try:
+        index(0 if patch_radius is None else patch_radius)
+    except TypeError as error:
+        raise InputError(f"patch_radius: a whole number was expected, found {shortened(patch_radius)}.") from error
 
 
 def check_patches(fixed: Tensor, radius: int) -> None:

@@ -114,7 +114,7 @@ def _correlate(moving, fixed, mean, scale, weights, radius, floor, keep, store):
                 smf += column_mf[left + side - 1]
                 spread = smm - sm * sm * inverse
                 product = a = b = 0.0
-                if spread > floor:
+                if not spread <= floor:  # nan stays nan
                     a = scale[top, left] / np.sqrt(spread)
                     product = (smf - sm * mean[top, left]) * a
                     b = product / spread

@@ -9,7 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import cpu
-from femoreg_torch.similarity.checks import check_patches, check_size, check_weights
+from femoreg_torch.similarity.checks import check_patches, check_size, check_weights, check_whole
 from femoreg_torch.similarity.curvature import patch_curvature
 from femoreg_torch.similarity.kernels import (
     FLAT,
@@ -38,6 +38,7 @@ class GradNcc:
     smoothing_px: float = 1.1
 
     def __post_init__(self) -> None:
+        check_whole(self.patch_radius)
         check_within(self, patch_radius=(1, 1000), smoothing_px=(0, 100))
 
     def against(self, fixed: Tensor, weights: Tensor | None = None) -> "FixedGradNcc":
@@ -75,7 +76,10 @@ class FixedGradNcc:
     taps: tuple[Tensor, Tensor]  # of the derivative, see `derivative_taps`
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Costs (B,) in [0, 2] of images (B, H, W), float64: mean over patches and both derivatives of 1 − NCC."""
+        """Costs (B,) in [0, 2] of images (B, H, W), float64: mean over patches and both derivatives of 1 − NCC.
+
+        Images that hold nan cost nan, and so does everything against a fixed one that does.
+        """
         check_size(images, self.fixed)
         if images.device.type == "cpu" and images.dtype == torch.float32:
             value: Tensor = _CpuGradNcc.apply(images, self)

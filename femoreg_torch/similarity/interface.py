@@ -39,18 +39,3 @@ class FieldSimilarity(Similarity, Protocol):
 
         Raises `InputError` if that leaves nothing to compare.
         """
-
-
-def against_field(
-    similarity: Similarity, fixed: Tensor, weights: Tensor | None, field: Tensor | None
-) -> FixedSimilarity:
-    """A similarity prepared with a fixed image (H, W) of which only `field` (H, W), bool, is exposed; None: all of it.
-
-    For one without `inside` the pixels outside weigh nothing.
-    """
-    if field is None:
-        return similarity.against(fixed, weights)
-    fixed = fixed.where(field, fixed.new_zeros(()))
-    if isinstance(similarity, FieldSimilarity):
-        return similarity.inside(field, fixed, weights)
-    return similarity.against(fixed, field.to(fixed) if weights is None else weights * field)

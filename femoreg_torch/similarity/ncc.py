@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.settings import check_within
-from femoreg_torch.similarity.checks import check_patches, check_size, check_weights
+from femoreg_torch.similarity.checks import check_patches, check_size, check_weights, check_whole
 from femoreg_torch.similarity.kernels import FLAT, patch_sums, patch_weights
 
 
@@ -21,6 +21,7 @@ class Ncc:
     patch_radius: int | None = None
 
     def __post_init__(self) -> None:
+        check_whole(self.patch_radius)
         check_within(self, patch_radius=(1, 1000))
 
     def against(self, fixed: Tensor, weights: Tensor | None = None) -> "FixedNcc | FixedPatchNcc":
@@ -53,7 +54,7 @@ class FixedNcc:
     weights: Tensor | None  # (H, W) float64 of the pixels
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Costs 1 − NCC (B,) in [0, 2], float64, of images (B, H, W); a flat image has NCC 0."""
+        """Costs 1 − NCC (B,) in [0, 2], float64, of images (B, H, W); a flat image has NCC 0, nan costs nan."""
         check_size(images, self.fixed)
         count = float(self.fixed.numel()) if self.weights is None else self.weights.sum()
         return 1 - _ncc(self.fixed, images.to(torch.float64), self._sums, count)[:, 0, 0]
@@ -71,7 +72,7 @@ class FixedPatchNcc:
     radius: int
 
     def __call__(self, images: Tensor) -> Tensor:
-        """Costs (B,) in [0, 2], float64, of images (B, H, W): weighted mean of 1 − NCC; a flat patch has NCC 0."""
+        """Costs (B,) in [0, 2], float64, of images (B, H, W): mean 1 − NCC; flat patches have NCC 0, nan costs nan."""
         check_size(images, self.fixed)
         count = float((2 * self.radius + 1) ** 2)
         values = _ncc(self.fixed, images.to(torch.float64), lambda maps: patch_sums(maps, self.radius), count)

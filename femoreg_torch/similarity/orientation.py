@@ -27,7 +27,7 @@ class GradientOrientation:
     def against(self, fixed: Tensor, weights: Tensor | None = None) -> "FixedGradientOrientation":
         """Prepare with the fixed image (H, W); `weights` (H, W) say where to look.
 
-        Raises `InputError` if the fixed image has no edge there.
+        Raises `InputError` if the fixed image has no edge there, or holds nan.
         """
         return self.inside(None, fixed, weights)
 
@@ -40,7 +40,10 @@ class GradientOrientation:
         kept = torch.ones_like(strength, dtype=torch.bool) if field is None else away_from(~field, len(taps[0]) // 2)
         if not kept.any():
             raise InputError("similarity: the field leaves no pixel to compare.")
-        strong = (strength > strength[kept].median()) & (strength > 0) & kept
+        middle = strength[kept].median()
+        if middle.isnan():
+            raise InputError("similarity: the fixed image holds nan where it is to be compared.")
+        strong = (strength > middle) & (strength > 0) & kept
         share = torch.ones_like(fixed) if weights is None else weights.to(fixed)
         if not (strong & (share > 0)).any():
             raise InputError("similarity: the fixed image has no edge where it is to be compared.")
@@ -60,16 +63,20 @@ class FixedGradientOrientation:
     def __call__(self, images: Tensor) -> Tensor:
         """Costs (B,) in [0, 1] of images (B, H, W): one minus the mean agreement of the directions.
 
-        An edge of the fixed image where the moving one is flat agrees by nothing.
+        An edge of the fixed image where the moving one is flat agrees by nothing. The gradient is that of the angles:
+        which pixels are above the median changes too, by jumps that no derivative tells, so a search by values alone
+        (`cma_es`, `bobyqa`) suits it. An image that holds nan costs nan.
         """
         check_size(images, self.fixed)
         moving = image_gradients(images, self.taps)  # (B, 2, H, W)
         strength = moving.detach().square().sum(1)
-        counts = self.strong & (strength > strength[:, self.kept].median(1).values[:, None, None]) & (strength > 0)
+        middle = strength[:, self.kept].median(1).values  # nan if any of them is
+        counts = self.strong & (strength > middle[:, None, None]) & (strength > 0)
         dot = (moving * self.fixed).sum(1)
         cross = moving[:, 0] * self.fixed[1] - moving[:, 1] * self.fixed[0]
         # Where nothing is compared, a dummy angle keeps the gradient of atan2 finite.
         angle = torch.atan2(torch.where(counts, cross, torch.zeros_like(cross)).abs(), torch.where(counts, dot, 1.0))
         agreement = (2 - torch.log(angle + 1)).clamp(min=0) / 2
         share = self.weights * self.strong
-        return 1 - (torch.where(counts, agreement, torch.zeros_like(agreement)) * share).sum((1, 2)) / share.sum()
+        cost = 1 - (torch.where(counts, agreement, torch.zeros_like(agreement)) * share).sum((1, 2)) / share.sum()
+        return torch.where(middle.isnan(), middle, cost)

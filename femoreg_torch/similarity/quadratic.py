@@ -7,6 +7,7 @@ differentiating twice, where J are the derivatives of the image I by the paramet
 Identifying and attacking the saddle point problem in high-dimensional non-convex optimization, NeurIPS 2014).
 """
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -17,6 +18,7 @@ from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
 from femoreg_torch.similarity import cpu
 from femoreg_torch.similarity.interface import FixedSimilarity, SmoothFixedSimilarity
+from femoreg_torch.similarity.watched import gave_nan, similarity_name, watched
 
 _TILE_PX = 44  # edge of a tile; as that of Grad-NCC with patches of radius 5
 
@@ -25,7 +27,8 @@ def similarity_quadratic(similarity: FixedSimilarity, image: Tensor, jacobian: T
     """Cost, scores (T, n) and positive semi-definite hessian (n, n), float64, of a similarity about an image (H, W).
 
     `jacobian` (H, W, n) holds the image's derivatives, see `SmoothFixedSimilarity`. Scores and hessian lie on the CPU,
-    wherever the image is. Raises `InputError` for a similarity that cannot be differentiated twice.
+    wherever the image is. Raises `InputError` for a similarity that cannot be differentiated twice, has no curvature,
+    or gives nan.
     """
     return similarity_quadratics([lambda: (similarity, image, jacobian)], image.device)[0]
 
@@ -48,7 +51,7 @@ def similarity_quadratics(
 
     found = on_all_cores(there, about, device)
     return [
-        (cost, scores, _checked(similarity, scores, hessian))
+        (cost, scores, _checked(similarity, cost, scores, hessian))
         for (similarity, _), (cost, scores, hessian) in zip(found, _on_the_cpu([f for _, f in found]), strict=True)
     ]
 
@@ -71,23 +74,36 @@ def _differentiated(similarity: FixedSimilarity, image: Tensor, jacobian: Tensor
     """Cost (), scores (T, n) and second derivatives (n, n) by differentiating a similarity twice."""
     moving = image[None].clone().requires_grad_()
     changes = jacobian.movedim(-1, 0)  # (n, H, W)
+    cost = watched(similarity, similarity)(moving)[0]
+    if not cost.requires_grad:
+        raise _not_smooth(similarity, "its costs carry no derivatives by the images")
     try:
-        cost = similarity(moving)[0]
-        (slope,) = torch.autograd.grad(cost, moving, create_graph=True)
+        slope = _slope(cost, moving, again=True)
         along = (changes * slope).sum((1, 2))  # (n,): the gradient
-        bent = [torch.autograd.grad(part, moving, retain_graph=True)[0] for part in along]  # Hessian-vector products
+        bent = [_slope(part, moving, again=False) for part in along]  # Hessian-vector products
     except RuntimeError as error:
-        raise _not_smooth(similarity, " ".join(str(error).split())) from error
+        reason = " ".join(str(error).split())
+        raise _not_smooth(similarity, f"it cannot be differentiated twice ({reason})") from error
     scores = tile_scores(changes, slope.detach(), _TILE_PX)
     hessian = changes.flatten(1).to(torch.float64) @ torch.cat(bent).flatten(1).to(torch.float64).T
     return cost.detach(), scores, hessian
 
 
-def _checked(similarity: FixedSimilarity, scores: Tensor, hessian: Tensor) -> Tensor:
-    """A hessian without negative curvature. Raises `InputError` for derivatives that are none.
+def _slope(value: Tensor, moving: Tensor, *, again: bool) -> Tensor:
+    """Derivative (1, H, W) of a value () by an image (1, H, W), maybe to be differentiated again; 0 of a constant."""
+    if not value.requires_grad:
+        return torch.zeros_like(moving)
+    slopes = torch.autograd.grad(value, moving, retain_graph=True, create_graph=again)
+    return slopes[0]
+
+
+def _checked(similarity: FixedSimilarity, cost: float, scores: Tensor, hessian: Tensor) -> Tensor:
+    """A hessian without negative curvature. Raises `InputError` for a cost or derivatives that are none.
 
     A similarity that knows its own derivatives is believed.
     """
+    if math.isnan(cost):
+        raise gave_nan(similarity)
     if isinstance(similarity, SmoothFixedSimilarity):
         return hessian
     if not (torch.isfinite(hessian).all() and torch.isfinite(scores).all()):
@@ -114,6 +130,6 @@ def _without_negative_curvature(hessian: Tensor) -> Tensor:
 
 def _not_smooth(similarity: FixedSimilarity, reason: str) -> InputError:
     return InputError(
-        f"similarity {type(similarity).__name__}: cannot be differentiated twice ({reason}). "
+        f"similarity {similarity_name(similarity)}: {reason}, and Levenberg–Marquardt needs slope and curvature. "
         "Choose an optimiser without derivatives, such as cma_es or bobyqa, or give it a `quadratic` of its own."
     )

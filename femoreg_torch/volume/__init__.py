@@ -21,7 +21,13 @@ from femoreg_torch.volume.reading import (
 )
 from femoreg_torch.volume.resample import crop, halved, resample_isotropic, sharpened
 from femoreg_torch.volume.segments import has_names, segment_names
-from femoreg_torch.volume.sides import merged_bones, stray_landmarks, swapped_sides
+from femoreg_torch.volume.sides import (
+    landmarks_beside_bones,
+    landmarks_without_bones,
+    merged_bones,
+    stray_landmarks,
+    swapped_sides,
+)
 from femoreg_torch.volume.solids import Solid, solid_volumes
 
 __all__ = [
@@ -43,6 +49,8 @@ __all__ = [
     "label_box_centre",
     "label_share",
     "labelled_device",
+    "landmarks_beside_bones",
+    "landmarks_without_bones",
     "looked_up",
     "merged_bones",
     "misplaced_labels",

@@ -18,7 +18,7 @@ from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.labels import label_box, looked_up
 
 _OTHER_BONE_HU = 80.0  # mean above which a label that no table names is bone, and a bone's rim does not grow into it
-_NEAR_VOXELS = 15  # a landmark lies closer than this to its bone
+_NEAR_MM = 15.0  # along every axis: a landmark lies closer than this to its bone
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,8 +189,9 @@ def nearest_label(labels: Volume, ids: Sequence[int], point: Tensor) -> int | No
 def nearest_voxel(labels: Volume, ids: Sequence[int], point: Tensor) -> tuple[int, float] | None:
     """Label and distance, mm, of the voxel with one of the `ids` closest to a point (3,), or None if none is near."""
     index = transform_points(torch.linalg.inv(labels.lps_from_index), point[None].double())[0].round().int()
-    low = (index - _NEAR_VOXELS).clamp_min(0).tolist()
-    high = (index + _NEAR_VOXELS + 1).clamp_min(0).tolist()
+    reach = (_NEAR_MM / torch.tensor(labels.spacing_mm)).ceil().int()
+    low = (index - reach).clamp_min(0).tolist()
+    high = (index + reach + 1).clamp_min(0).tolist()
     part = labels.data[low[2] : high[2], low[1] : high[1], low[0] : high[0]]
     where = torch.isin(part, torch.tensor(ids, dtype=part.dtype)).nonzero()
     if len(where) == 0:

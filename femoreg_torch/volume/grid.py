@@ -1,5 +1,6 @@
 """A volume: numbers on a regular grid in patient space (or, for a device, in CAD space)."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -7,22 +8,39 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 
+# Edges of voxels and places, mm. Far beyond what is scanned, and so that indices and mm can be told in float64.
+_VOXEL_MM = (1e-6, 1e6)
+_FARTHEST_MM = 1e9
+_LEAST_DETERMINANT = 1e-6  # of the three unit axes: 1 where they are square to each other, 0 in one plane
+_LAST_ROW, _ROUNDING = (0.0, 0.0, 0.0, 1.0), 1e-9
+
 
 @dataclass(frozen=True, eq=False)  # compared and hashed by identity, so that back ends can cache what they derive
 class Volume:
     """Values `data` (Z, Y, X), indexed [z, y, x], voxel centres at integers.
 
-    `lps_from_index` (4, 4) float64 maps (x, y, z) indices to mm: LPS for a CT, CAD axes for a device.
+    `lps_from_index` (4, 4) float64 maps (x, y, z) indices to mm: LPS for a CT, CAD axes for a device. It lies on the
+    CPU wherever the data are. Raises `InputError` for one that is not finite or that no grid of voxels has.
     """
 
     data: Tensor
     lps_from_index: Tensor
 
     def __post_init__(self) -> None:
+        if not isinstance(self.data, Tensor):
+            raise InputError(
+                f"volume: data must be a torch tensor, got {type(self.data).__name__}. Use torch.from_numpy."
+            )
         if self.data.ndim != 3:
             raise InputError(f"volume: data must be (Z, Y, X), got shape {tuple(self.data.shape)}.")
-        if self.lps_from_index.shape != (4, 4) or self.lps_from_index.dtype != torch.float64:
+        if self.data.is_complex():
+            raise InputError("volume: data must be real, got complex numbers. Take their .real or .abs().")
+        affine = self.lps_from_index
+        if not isinstance(affine, Tensor) or affine.shape != (4, 4) or affine.dtype != torch.float64:
             raise InputError("volume: lps_from_index must be a 4×4 float64 tensor.")
+        if affine.device.type != "cpu":
+            raise InputError(f"volume: lps_from_index lies on {affine.device}; it belongs on the CPU, call .cpu().")
+        _check_affine(affine.tolist())
 
     @property
     def spacing_mm(self) -> tuple[float, float, float]:
@@ -52,6 +70,29 @@ class Volume:
         """The same with its values on a device; the volume itself if they lie there. The affine stays on the CPU."""
         data = self.data.to(device)
         return self if data is self.data else Volume(data, self.lps_from_index)
+
+
+def _check_affine(rows: list[list[float]]) -> None:
+    """Raise `InputError` for a `lps_from_index` (4 rows) of no grid. In plain Python, for it is a few numbers."""
+    if not all(math.isfinite(value) for row in rows for value in row):
+        raise InputError("volume: lps_from_index holds values that are not finite.")
+    if any(abs(found - wanted) > _ROUNDING for found, wanted in zip(rows[3], _LAST_ROW, strict=True)):
+        raise InputError(f"volume: the last row of lps_from_index must be 0, 0, 0, 1, got {rows[3]}.")
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), _ = rows
+    edges = math.hypot(a, d, g), math.hypot(b, e, h), math.hypot(c, f, i)
+    if min(edges) < _VOXEL_MM[0] or max(edges) > _VOXEL_MM[1]:
+        told = " × ".join(f"{edge:.3g}" for edge in edges)
+        raise InputError(
+            f"volume: its voxels have edges of {told} mm, expected between {_VOXEL_MM[0]:g} and {_VOXEL_MM[1]:g} mm. "
+            "Give lps_from_index in mm."
+        )
+    if max(abs(x), abs(y), abs(z)) > _FARTHEST_MM:
+        raise InputError(
+            f"volume: its first voxel lies at {x:.3g}, {y:.3g}, {z:.3g} mm, farther than {_FARTHEST_MM:g} mm."
+        )
+    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    if abs(determinant) < _LEAST_DETERMINANT * math.prod(edges):
+        raise InputError("volume: the axes of lps_from_index lie in one plane, so it has no inverse.")
 
 
 def changes_in_place(data: Tensor) -> int:

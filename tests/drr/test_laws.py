@@ -233,3 +233,66 @@ def test_poses_of_one_volume_of_the_wrong_shape_are_refused(shape):
 def test_poses_that_are_not_finite_are_refused():
     with pytest.raises(InputError, match="not finite"):
         project([centred(torch.ones(4, 4, 4))], facing(math.nan), CAMERA)
+
+
+@pytest.mark.parametrize("with_gradient", [False, True])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda pose: pose[3, 3].fill_(2), "last row"),
+        (lambda pose: pose[3, 2].fill_(0.1), "last row"),
+        (lambda pose: pose[:3, :3].zero_(), "no inverse"),
+        (lambda pose: pose[1, 1].fill_(1e-15), "no inverse"),
+        (lambda pose: pose[0, 3].fill_(1e30), "out of reach"),
+        (lambda pose: pose[0, 3].fill_(math.inf), "not finite"),
+        (lambda pose: pose[:3, :3].mul_(1e8), "samples"),
+    ],
+)
+def test_poses_that_the_kernels_cannot_follow_are_refused(change, says, with_gradient):
+    """Without the check they read out of bounds, which ends the process, or run for ever."""
+    volume, pose = centred(torch.ones(4, 4, 4)), facing()[:, 0].clone()
+    change(pose[0])
+    pose.requires_grad_(with_gradient)
+    with pytest.raises(InputError, match=says):
+        project(volume, pose, CAMERA)
+    with pytest.raises(InputError, match=says):
+        project_with_jacobian(volume, pose.detach(), CAMERA, float64(0, 0, 620))
+
+
+@pytest.mark.parametrize("step_mm", [0, -1.0, math.nan, math.inf, "1", None])
+def test_steps_that_are_none_are_refused(step_mm):
+    volume, pose = centred(torch.ones(4, 4, 4)), facing()[:, 0]
+    with pytest.raises(InputError, match=r"step_mm must be positive and finite, got"):
+        project(volume, pose, CAMERA, step_mm)
+    with pytest.raises(InputError, match=r"step_mm must be positive and finite, got"):
+        project_with_jacobian(volume, pose, CAMERA, float64(0, 0, 620), step_mm)
+
+
+def test_a_step_may_be_short_but_not_endlessly():
+    """A million samples along the diagonal of a volume are several hundred per voxel of a large CT."""
+    volume, pose, camera = centred(torch.ones(4, 4, 4)), facing()[:, 0], centred_camera(1000.0, (1.0, 1.0), (1, 1))
+    assert project(volume, pose, camera, 1e-4)[0, 0, 0] == pytest.approx(4, rel=1e-3)
+    with pytest.raises(InputError, match=r"samples through a volume of 5 mm at step_mm = 1e-09; 1e\+06 are the limit"):
+        project(volume, pose, camera, 1e-9)
+    huge = Volume(torch.ones(4, 4, 4), float64(1e5, 1e5, 1e5, 1).diag())
+    with pytest.raises(InputError, match="in mm"):
+        project(huge, pose, camera, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda volume, poses: project([], poses[:, None], CAMERA), "no volume"),
+        (lambda volume, poses: project([volume.data], poses[:, None], CAMERA), "a Volume or a list"),
+        (lambda volume, poses: project(volume, poses.numpy(), CAMERA), "torch tensor, got ndarray"),
+        (lambda volume, poses: project([volume], poses[:, None].numpy(), CAMERA), "torch tensor, got ndarray"),
+        (lambda volume, poses: project(volume, poses.to(torch.complex128), CAMERA), "complex"),
+        (lambda volume, poses: project(volume, poses, CAMERA.shape), "a Camera is needed"),
+        (lambda volume, poses: project_with_jacobian(volume, poses.numpy(), CAMERA, poses[0, :3, 3]), "torch tensor"),
+        (lambda volume, poses: project_with_jacobian(volume, poses[0], CAMERA, poses[0, :3, 3]), r"\(B, 4, 4\)"),
+        (lambda volume, poses: project_with_jacobian(volume, poses, CAMERA, poses[0, :3]), "a centre of shape"),
+    ],
+)
+def test_arguments_of_the_wrong_kind_are_told_in_one_line(call, says):
+    with pytest.raises(InputError, match=says):
+        call(centred(torch.ones(4, 4, 4)), facing()[:, 0])

@@ -1,6 +1,7 @@
 """The camera against OpenCV, and its windows and coarser grids against plain array slicing and averaging."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -99,6 +100,42 @@ def test_an_empty_window_is_refused(rows):
 def test_an_impossible_camera_is_refused(sdd, pixel, shape):
     with pytest.raises(InputError, match="positive"):
         centred_camera(sdd, pixel, shape)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"sdd_mm": math.inf}, "sdd_mm must be finite"),
+        ({"sdd_mm": 1e200}, "sdd_mm must be finite"),
+        ({"pixel_mm": (0.3, math.inf)}, "pixel_mm must be finite"),
+        ({"pixel_mm": (1e-30, 0.3)}, "pixel_mm must be finite"),
+        ({"pixel_mm": (0.3,)}, "pixel_mm must be two numbers"),
+        ({"principal_point_px": (math.nan, 4.0)}, "principal_point_px must be finite"),
+        ({"principal_point_px": (4.0, -math.inf)}, "principal_point_px must be finite"),
+        ({"shape": (40.0, 60.0)}, "two whole numbers"),
+        ({"shape": (40, 60, 1)}, "shape must be two"),
+    ],
+)
+def test_values_that_no_camera_has_are_refused_by_name(values, says):
+    with pytest.raises(InputError, match=says):
+        replace(CAMERA, **values)
+
+
+def test_whole_numbers_of_numpy_and_parallel_beams_are_fine():
+    assert replace(CAMERA, shape=(np.int64(4), 5)).downsampled(np.int64(2)).shape == (2, 2)
+    assert replace(CAMERA, sdd_mm=1e7, principal_point_px=(-1e5, 1e5)).sdd_mm == 1e7
+
+
+@pytest.mark.parametrize("factor", [0, -1, 2.5, 2.0, True])
+def test_blocks_of_no_whole_number_of_pixels_are_refused(factor):
+    with pytest.raises(InputError, match="a whole number of pixels"):
+        CAMERA.downsampled(factor)
+
+
+def test_blocks_larger_than_the_detector_are_refused():
+    assert CAMERA.downsampled(120).shape == (1, 1)
+    with pytest.raises(InputError, match="no block of 121 × 121 pixels"):
+        CAMERA.downsampled(121)
 
 
 def test_a_changed_camera_and_its_coarser_grid_change_alike() -> None:

@@ -20,7 +20,8 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.intake import check_case
 from femoreg_torch.intake.volumes import ct_warnings
 from femoreg_torch.registration import prepare_scene
-from femoreg_torch.volume import read_ct, read_label_map
+from femoreg_torch.volume import Volume, axis_aligned, read_ct, read_label_map
+from femoreg_torch.volume.bones import nearest_voxel
 
 PLANES_PX = 315  # of three planes of that CT: 60 voxels of 4 mm high, 420 pixels for 80 of them
 
@@ -462,3 +463,50 @@ def test_bones_as_light_as_foam_are_a_warning(files: Path, tmp_path: Path) -> No
     assert checked.problems == ()
     assert any(told in warning for warning in checked.warnings)
     assert any(told in note for note in prepare_scene(read_case(folder)).missing)
+
+
+def warned(folder: Path, content: Content) -> str:
+    write_content(folder, content)
+    checked = check_case(folder, find_start=False)
+    assert checked.problems == ()
+    return "\n".join(checked.warnings)
+
+
+def test_points_beside_their_bones_are_a_warning(files: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    content = case_content()
+    for told in ("beside the", "outside the femur", "from the middle of the sphere"):
+        assert told not in warned(folder, content)
+    moved(content, folder, "ASIS-r", (-90.0, -33.0, 58.0))
+    assert re.search(r"ASIS-r lies 1\d mm beside the hip_right: look at it", warned(folder, content))
+    moved(content, folder, "FH-l", (HEAD[0], HEAD[1], HEAD[2] + 10.0))
+    assert "FH-l lies 10 mm from the middle of the sphere that fits the femoral head" in warned(folder, content)
+    moved(content, folder, "FH-l", HEAD)
+    x, y, z = content["plan"]["entry_point"]
+    content["plan"]["entry_point"] = [x + 10.0, y, z]
+    assert "mm outside the femur: look at it" in warned(folder, content)
+
+
+def test_a_bone_with_landmarks_that_the_label_map_does_not_tell_is_a_warning(files: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    content = case_content()
+    content["ct"]["bones"] = {"hip_left": [1], "sacrum": [4], "femur_left": [5], "femur_right": [6]}
+    told = "label map: does not tell the hip_right, which landmarks lie on (GSN-r, IOF-r, MOF-r, SPS-r, IPS-r, ASIS-r)"
+    assert told in warned(folder, content)
+    assert any(told in remark for remark in prepare_scene(read_case(folder)).missing)
+    content["ct"]["bones"] |= {"hip_right": [2]}
+    assert "does not tell" not in warned(folder, content)
+
+
+def test_how_near_a_bone_is_does_not_hang_on_the_voxels() -> None:
+    """10 mm beside a bone, on voxels of 0.5 and of 5 mm; 40 mm beside it is near on none."""
+    for mm in (0.5, 5.0):
+        data = torch.zeros(int(100 / mm), 4, 4, dtype=torch.uint8)
+        data[: int(20 / mm)] = 1
+        labels = Volume(data, axis_aligned((mm, mm, mm), (0.0, 0.0, 0.0)))
+        found = nearest_voxel(labels, [1], torch.tensor([0.0, 0.0, 30.0], dtype=torch.float64))
+        assert found is not None
+        assert found[1] == pytest.approx(10.5 if mm == 0.5 else 15.0, abs=mm)
+        assert nearest_voxel(labels, [1], torch.tensor([0.0, 0.0, 60.0], dtype=torch.float64)) is None

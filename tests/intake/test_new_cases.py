@@ -433,3 +433,25 @@ def test_a_folder_as_it_was_exported(files: Path, tmp_path: Path, capsys: pytest
     (tmp_path / "empty" / "README").write_text("nothing", encoding="utf-8")
     assert main(arguments(files, tmp_path / "none", images=[tmp_path / "empty"])) == 2
     assert "empty: a folder without images" in capsys.readouterr().err
+
+
+def test_parts_that_no_bone_is_called_by_are_named(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = sitk.ReadImage(str(files / "bones.seg.nrrd"))
+    image.SetMetaData("Segment1_Name", "Hueftbein rechts")
+    sitk.WriteImage(image, str(tmp_path / "mine.seg.nrrd"))
+    assert main(arguments(files, tmp_path / "case", labels=tmp_path / "mine.seg.nrrd")) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "parts of mine.seg.nrrd that are taken for no bone: Hueftbein rechts" in told
+    assert "does not tell the hip_right, which landmarks lie on" in told
+
+
+def test_where_the_source_stands_is_told_where_nobody_says_it(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = "the source is taken to stand in front of the patient"
+    assert main(arguments(files, tmp_path / "case", ignore_header=True)) == 0
+    assert told in " ".join(capsys.readouterr().out.split())
+    assert main(arguments(files, tmp_path / "other", ignore_header=True, source="anterior")) == 0
+    assert told not in " ".join(capsys.readouterr().out.split())

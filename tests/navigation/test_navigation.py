@@ -236,8 +236,11 @@ def test_of_a_round_device_no_direction_in_its_frame_is_trusted(tmp_path: Path) 
     assert main(["navigate", str(run)]) == 0
     content = json.loads((run / "navigation.json").read_text(encoding="utf-8"))
     assert content["trusted"] is False
-    assert "round" in content["reasons"][0]
-    assert "NOT TRUSTED: the device is round" in (run / "navigation" / "correction_in_device.txt").read_text("utf-8")
+    assert content["turn_told"] is False
+    assert "turn of the device" in content["reasons"][0]
+    assert "NOT TRUSTED: no image tells the turn of the device" in (
+        run / "navigation" / "correction_in_device.txt"
+    ).read_text("utf-8")
 
 
 def test_a_result_that_does_not_speak_of_trust_has_none(tmp_path: Path) -> None:

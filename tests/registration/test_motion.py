@@ -95,13 +95,40 @@ def test_a_device_that_moved_between_the_views_is_told() -> None:
     held = replace(still, images=still.images | {"device": images})
     for scene, told in ((still, 0), (held, 1)):
         covariance = pose_covariance(scene, truth, _LEVEL, GradNcc(1))
-        assert [drift.views for drift in covariance.drifts] == [(0,), (1,), (2,)]
-        assert {drift.objects for drift in covariance.drifts} == {("device",)}
+        of_device = [drift for drift in covariance.drifts if drift.objects == ("device",)]
+        assert [drift.views for drift in of_device] == [(0,), (1,), (2,)]
         said = doubts_about_motion(covariance)
         assert len(said) == told, said
     assert "in the device image of view 2, the device lies elsewhere" in said[0]
     best = max(covariance.drifts, key=lambda drift: drift.gain)
     assert best.views == (1,)
+
+
+def test_a_leg_that_turned_between_the_views_is_told() -> None:
+    """In the images of view 3, without and with the device, on pixels of 3 mm; the femur lies as views 1 and 2 say."""
+    truth = true_poses()
+    still = make_scene(truth)
+    turned = off(truth.camera1_from["femur"], REFERENCE_POINTS["femur"], (0, 0, 3.0), (0.5, 0, 0))
+    elsewhere = make_scene(truth.with_object("femur", turned), seed=1).images
+    images = {kind: (*of[:2], elsewhere[kind][2]) for kind, of in still.images.items()}
+    for scene, told in ((still, 0), (replace(still, images=images), 1)):
+        covariance = pose_covariance(scene, truth, _LEVEL, GradNcc(1))
+        of_femur = [drift for drift in covariance.drifts if drift.objects == ("femur",)]
+        assert [drift.views for drift in of_femur] == [(0,), (1,), (2,)]
+        said = doubts_about_motion(covariance)
+        assert len(said) == told, said
+    assert "in view 3, the femur lies" in said[0]
+    assert float(of_femur[2].motion[2]) == pytest.approx(3.0, abs=0.6)
+
+
+@pytest.mark.parametrize(("gain", "told"), [(0.004, 1), (0.0025, 0)])
+def test_a_bone_must_gain_more_than_a_device_to_have_drifted(gain: float, told: int) -> None:
+    motion = torch.tensor([0.0, 0.0, 1.5, 0.9, 0.4, 0.0], dtype=torch.float64)
+    drift = MotionBetween(None, (1,), ("femur",), motion, motion.abs() / 5 + 1e-9, gain)
+    covariance = replace(
+        pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(), drifts=(drift,)
+    )
+    assert len(doubts_about_motion(covariance)) == told
 
 
 @pytest.mark.parametrize(("gain", "sigmas", "told"), [(0.0025, 1.1, 1), (0.0012, 3.5, 1), (0.0015, 2.2, 0)])

@@ -10,10 +10,10 @@ from torch.nn import functional as F
 
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Poses, centred_camera
-from femoreg_torch.registration import Scene
+from femoreg_torch.registration import Scene, doubts
 from femoreg_torch.registration.doubts import doubts_about_rigidity
 from femoreg_torch.registration.imaging import PLAIN
-from femoreg_torch.registration.rigidity import CUTS, bend
+from femoreg_torch.registration.rigidity import CUTS, Bend, bend
 from femoreg_torch.registration.scene import Kind
 from femoreg_torch.volume import Volume
 
@@ -79,6 +79,18 @@ def test_a_broken_object_is_doubted_by_as_much_as_it_is_bent(scene: Scene, name:
     (doubt,) = doubts_about_rigidity(broken, TRUTH, PLAIN)
     assert f"the images show the ends of the {name}" in doubt
     assert "bent or broken" in doubt
+
+
+def test_a_break_that_is_small_and_yet_explains_the_images_is_doubted(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A neck that broke by 6° was 1.3 mm apart, less than what limits alone told, and gained ten times as much as
+    unbroken ones."""
+    motion = torch.tensor([4.0, 0, 0, 0.5, 0, 0], dtype=torch.float64)
+    for apart, gain, told in ((1.3, 0.0012, 1), (1.3, 0.0003, 0), (0.5, 0.0012, 0)):
+        ends = Bend(motion, motion.abs() / 3 + 1e-9, apart, 0.6, gain)
+        monkeypatch.setattr(doubts, "bend", lambda *asked, ends=ends: ends if asked[2] == "femur" else None)
+        assert len(doubts_about_rigidity(scene, TRUTH, PLAIN)) == told, (apart, gain)
 
 
 def test_an_end_that_no_two_views_show_is_not_asked(scene: Scene) -> None:

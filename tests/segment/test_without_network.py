@@ -11,10 +11,10 @@ from pelvis_scene import HEADS, pelvis_scene
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
-from femoreg_torch.segment import Segmentation, segment_bones_without_network
+from femoreg_torch.segment import Segmentation, segment_bones_without_network, without_network
 from femoreg_torch.segment.refine import contact
 from femoreg_torch.segment.sheets import APART, BONE, OUTSIDE, Links, enclosure, minimum_cut, sheetness
-from femoreg_torch.segment.without_network import femoral_heads
+from femoreg_torch.segment.without_network import Head, femoral_heads
 from femoreg_torch.volume import Volume
 
 NUMBERS = {name: 1 + n for n, name in enumerate(HIP.bone_names)}
@@ -131,3 +131,27 @@ def test_a_ct_without_a_hip_is_refused_in_one_line(scene: tuple[Volume, NDArray[
     plate[60:64] = 900.0
     with pytest.raises(InputError, match="no femoral head was found"):
         segment_bones_without_network(ct.with_data(plate))
+
+
+@pytest.mark.parametrize("scale", [0.75, 1.5])
+def test_a_ball_that_is_too_small_or_too_large_is_no_head(
+    scene: tuple[Volume, NDArray[np.uint8]], scale: float
+) -> None:
+    """A pelvis of that size looks the same but for its millimetres: heads of 17 or 34 mm, which no adult has."""
+    affine = scene[0].lps_from_index.clone()
+    affine[:3] *= scale
+    with pytest.raises(InputError, match=r"no femoral head was found|what looks like a femoral head"):
+        segment_bones_without_network(Volume(scene[0].data, affine), refine=False)
+
+
+@pytest.mark.parametrize("place", [(125.0, 0.0, -60.0), (70.0, 20.0, 70.0)], ids=["in the shaft", "in the ilium"])
+def test_a_head_in_no_socket_is_refused(
+    scene: tuple[Volume, NDArray[np.uint8]], place: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heads = [Head(np.array(place), 23.0, 1.0)]
+    monkeypatch.setattr(without_network, "femoral_heads", lambda ct: heads)
+    says = (
+        f"at LPS {place[0]:.0f}, {place[1]:.0f}, {place[2]:.0f} mm .* lies in no socket of a hip bone. A CT of the hip"
+    )
+    with pytest.raises(InputError, match=says):
+        segment_bones_without_network(scene[0])

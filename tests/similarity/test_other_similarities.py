@@ -85,6 +85,30 @@ def test_orientation_equals_angles_compared_pixel_by_pixel() -> None:
     assert GradientOrientation().against(fixed)(moving[None]).item() == pytest.approx(expected, abs=1e-5)
 
 
+@every_similarity
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("pixels", ["one", "all"])
+def test_an_image_that_holds_nan_costs_nan_and_no_other_does(
+    similarity: Similarity, pixels: str, dtype: torch.dtype
+) -> None:
+    images = torch.stack([picture(3), picture(4)]).to(dtype)
+    if pixels == "one":
+        images[0, 20, 16] = math.nan
+    else:
+        images[0] = math.nan
+    costs = similarity.against(picture(5).to(dtype), None)(images)
+    assert costs.isnan().tolist() == [True, False]
+    costs = similarity.against(picture(5).to(dtype), None)(images.requires_grad_())
+    assert costs.isnan().tolist() == [True, False]
+
+
+@pytest.mark.parametrize("similarity", [GradNcc(3), Ncc(), Ncc(3)], ids=str)
+def test_against_a_fixed_image_that_holds_nan_all_costs_are_nan(similarity: Similarity) -> None:
+    fixed = picture(5)
+    fixed[20, 16] = math.nan
+    assert similarity.against(fixed, None)(picture(3)[None]).isnan().all()
+
+
 def test_weights_choose_where_to_look() -> None:
     fixed = picture(11)
     moving = fixed.clone()
@@ -105,6 +129,9 @@ def test_weights_choose_where_to_look() -> None:
         (lambda: Ncc().against(picture(0), torch.zeros(40, 33)), "all pixel weights are zero"),
         (lambda: Ncc().against(picture(0), torch.ones(40, 30)), "weights are"),
         (lambda: GradientOrientation().against(torch.ones(9, 9)), "no edge"),
+        (lambda: GradientOrientation().against(torch.full((9, 9), math.nan)), "the fixed image holds nan"),
+        (lambda: Ncc(2.5), "patch_radius: a whole number was expected, found 2.5"),  # type: ignore[arg-type]
+        (lambda: GradNcc(5.0), "patch_radius: a whole number"),  # type: ignore[arg-type]
     ],
 )
 def test_bad_input_is_told(call, says: str) -> None:  # type: ignore[no-untyped-def]

@@ -6,6 +6,7 @@ import pytest
 import torch
 from pictures import picture
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.similarity import GradientOrientation, GradNcc, Ncc, Similarity, similarity_quadratic
@@ -83,19 +84,38 @@ def test_at_a_match_the_curvature_of_ncc_is_that_of_its_values() -> None:
     torch.testing.assert_close(hessian, expected, rtol=1e-4, atol=1e-5)
 
 
+class _Once(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, images):  # type: ignore[no-untyped-def]
+        return images.sum((1, 2))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, upstream):  # type: ignore[no-untyped-def]
+        return upstream[:, None, None].expand(-1, 60, 53)
+
+
 @pytest.mark.parametrize(
-    "cost",
+    ("cost", "reason"),
     [
-        lambda images: images.detach().sum((1, 2)),  # no gradient
-        lambda images: images.sum((1, 2)),  # no second derivative
-        absolute_differences,  # none either
-        lambda images: images.sum((1, 2)).sqrt() * float("nan"),
+        (lambda images: images.detach().sum((1, 2)), "its costs carry no derivatives by the images"),
+        (lambda images: images.sum((1, 2)), "its second derivative is zero"),
+        (absolute_differences, "its second derivative is zero"),
+        (lambda images: _Once.apply(images) ** 2, "it cannot be differentiated twice"),
+        (lambda images: (images * 0).sum((1, 2)).sqrt(), "its derivatives are not finite"),
     ],
 )
-def test_what_cannot_be_differentiated_twice_is_told(cost) -> None:  # type: ignore[no-untyped-def]
+def test_what_has_no_slope_or_curvature_is_told(cost, reason) -> None:  # type: ignore[no-untyped-def]
     _, moving, jacobian = scene()
-    with pytest.raises(InputError, match="Choose an optimiser without derivatives"):
+    with pytest.raises(InputError, match=f"similarity .*: {reason}.*Choose an optimiser without derivatives"):
         similarity_quadratic(cost, moving, jacobian)
+
+
+@pytest.mark.parametrize("similarity", [GradNcc(_RADIUS), Ncc(), GradientOrientation(), SquaredDifferences()], ids=str)
+def test_nan_is_told_as_nan(similarity: Similarity) -> None:
+    fixed, moving, jacobian = scene()
+    with pytest.raises(InputError, match=r"similarity .*: gave nan"):
+        similarity_quadratic(similarity.against(fixed, None), moving * float("nan"), jacobian)
 
 
 def test_curvature_equals_a_literal_sum_over_patches() -> None:

@@ -1,0 +1,150 @@
+"""What images with a device show besides it: cement, a hand, or another wire, which it may have been taken for.
+
+Images without and with a device, from one C-arm pose, differ in what came between them: in the logarithm of intensity
+by the shadow of the device, and by nothing elsewhere. Where they differ there, something else came or went.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.fluoro import natural
+from femoreg_torch.geometry import Poses, transform_points
+from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.imaging import Imaging, draw
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.scene import Body, Kind, Scene, moved, reference_point_in_view
+from femoreg_torch.registration.weights import dilated
+from femoreg_torch.similarity import GradNcc
+
+_LEVEL = Level(pixel_mm=3.1, step_mm=1.0)
+_SIMILARITY = GradNcc(patch_radius=5)
+_SHADOW = 0.15  # of the logarithm of intensity: what is seen of 0.15 mm of steel or 8 mm of water
+_AROUND_MM = 6.0  # on the detector, beside what is drawn: of a pose or model that is a little wrong
+_LEAST_SHARE, _LEAST_MM2 = 0.2, 150.0  # of the device's own shadow, and on the detector
+_INSIDE = 0.2  # of the greatest attenuation: what counts as the device
+_MOST_POINTS = 5_000
+_NEAREST_MM, _FARTHEST_MM, _STEP_MM = 4.0, 30.0, 2.0  # across the device: where another one is looked for
+_STARTS = 5
+_OPTIMISER = LevenbergMarquardt(max_iterations=8, tol_x=0.02, tol_f=1e-5)
+_SCALE = (0.03, 0.03, 0.03, 1.0, 1.0, 3.0)  # rad and mm: one unit of a motion
+_APART_MM = 2.5  # what lies nearer is the device itself
+
+
+@dataclass(frozen=True)
+class Besides:
+    """What the images of one view show besides a device: mm² on the detector."""
+
+    view: int  # from 0
+    device_mm2: float  # of the device's own shadow
+    more_mm2: float  # darker with the device than without it
+    less_mm2: float  # brighter
+
+    @property
+    def more(self) -> bool:
+        """Whether something came with the device."""
+        return self.more_mm2 > max(_LEAST_SHARE * self.device_mm2, _LEAST_MM2)
+
+    @property
+    def less(self) -> bool:
+        """Whether something went when the device came."""
+        return self.less_mm2 > max(_LEAST_SHARE * self.device_mm2, _LEAST_MM2)
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another place where a device fits the images with it."""
+
+    apart_mm: float  # across its long axis
+    share: float  # of the similarity that the device adds where it was found
+
+
+def besides(scene: Scene, poses: Poses, name: str, kind: Kind) -> list[Besides]:
+    """What images of a `kind` show besides a device that those of the first kind lack, or the other way round.
+
+    Views without one of the images, or without natural logarithms in both, are left out.
+    """
+    return [
+        found for _, view in scene.there([kind], range(scene.views)) if (found := _look(scene, poses, name, kind, view))
+    ]
+
+
+def _look(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Besides | None:
+    if not scene.there([scene.first_kind], (view,)):
+        return None
+    images = [scene.image(each, view) for each in (scene.first_kind, kind)]
+    if not all(map(natural, images)):
+        return None
+    camera = poses.camera(view, _LEVEL.camera(scene.carm.camera))
+    without, with_it = (_LEVEL.image(image, scene.carm.camera) for image in images)
+    exposed = torch.ones(camera.shape, dtype=torch.bool, device=without.device)
+    for each in (scene.first_kind, kind):
+        field = scene.field(each, view)
+        if field is not None:
+            exposed &= _LEVEL.field(field, scene.carm.camera)
+    drawn = draw([scene.objects[name]], poses.camera_from(name)[view][None, None], camera, _LEVEL.step_mm)[0] > 0
+    around = dilated(drawn, _AROUND_MM, camera)
+    elsewhere = exposed & ~around
+    if not elsewhere.any():
+        return None
+    change = with_it - without
+    change = change - change[elsewhere].median()  # exposures differ
+    mm2 = math.prod(camera.pixel_mm)
+    areas = (drawn & exposed & (change > _SHADOW), elsewhere & (change > _SHADOW), elsewhere & (change < -_SHADOW))
+    return Besides(view, *(mm2 * int(area.count_nonzero()) for area in areas))
+
+
+def rival(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -> Rival | None:
+    """The best other place of a device within 30 mm across its long axis, by images of a `kind`; all else stays.
+
+    None where none of the best few starts ends elsewhere.
+    """
+    thing, pose = scene.objects[name], poses.camera1_from[name]
+    filled = (thing.volume.data > _INSIDE * thing.volume.data.max()).nonzero().cpu()
+    filled = filled[:: 1 + len(filled) // _MOST_POINTS].flip(1).double()
+    points = transform_points(pose @ thing.volume.lps_from_index, filled)
+    axes = torch.linalg.eigh((points - points.mean(0)).T @ (points - points.mean(0))).eigenvectors  # the last is long
+    centre, scale = reference_point_in_view(scene, poses, name, 0), torch.tensor(_SCALE, dtype=torch.float64)
+    body = Body((name,), 0, centre, scale)
+    images = scene.there([kind], range(scene.views))
+    costs = image_costs(scene, poses, (body,), tuple(poses.camera1_from), images, _LEVEL, _SIMILARITY, imaging=imaging)
+    here = float(costs(costs.still[None]).mean())
+    gain = float(costs.without_what_moves().mean()) - here
+    deltas = torch.zeros(len(_places()), 6, dtype=torch.float64)
+    deltas[:, 3:] = _places() @ axes[:, :2].T / scale[3:]
+    found: list[Rival] = []
+    for start in _apart(deltas[costs(deltas).mean(1).argsort()], scale):
+        begun = moved(poses, (body,), start)
+        again = Body((name,), 0, reference_point_in_view(scene, begun, name, 0), scale)
+        there = image_costs(
+            scene, begun, (again,), tuple(poses.camera1_from), images, _LEVEL, _SIMILARITY, imaging=imaging
+        )
+        result = _OPTIMISER.minimise(stage_objective(there, (again,), None), 6, seed=0)
+        ended = moved(begun, (again,), result.delta).camera1_from[name]
+        away = transform_points(ended @ thing.volume.lps_from_index, filled).mean(0) - points.mean(0)
+        across = float((away @ axes[:, :2]).norm())
+        if across > _APART_MM:
+            found.append(Rival(across, (gain + here - result.value) / gain))
+    return max(found, key=lambda each: each.share, default=None)
+
+
+def _places() -> Tensor:
+    """Places (N, 2) on a grid, mm across."""
+    steps = torch.arange(-_FARTHEST_MM, _FARTHEST_MM + _STEP_MM, _STEP_MM, dtype=torch.float64)
+    places = torch.cartesian_prod(steps, steps)
+    away = places.norm(dim=1)
+    return places[(away >= _NEAREST_MM) & (away <= _FARTHEST_MM)]
+
+
+def _apart(ordered: Tensor, scale: Tensor) -> list[Tensor]:
+    """The first few of deltas (N, 6) that lie 2 grid steps and more from one another."""
+    kept: list[Tensor] = []
+    for delta in ordered:
+        if all(float(((delta - other) * scale)[3:].norm()) > 2 * _STEP_MM for other in kept):
+            kept.append(delta)
+        if len(kept) == _STARTS:
+            break
+    return kept
