@@ -5,10 +5,12 @@ by the shadow of the device, and by nothing elsewhere. Where they differ there, 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from femoreg_torch.fluoro import natural
 from femoreg_torch.geometry import Poses, transform_points
@@ -27,11 +29,11 @@ _AROUND_MM = 6.0  # on the detector, beside what is drawn: of a pose or model th
 _LEAST_SHARE, _LEAST_MM2 = 0.2, 150.0  # of the device's own shadow, and on the detector
 _INSIDE = 0.2  # of the greatest attenuation: what counts as the device
 _MOST_POINTS = 5_000
-_NEAREST_MM, _FARTHEST_MM, _STEP_MM = 4.0, 30.0, 2.0  # across the device: where another one is looked for
+_NEAREST_MM, _FARTHEST_MM, _STEP_MM = 4.0, 24.0, 2.0  # along both axes across the device: where another is looked for
 _STARTS = 5
-_OPTIMISER = LevenbergMarquardt(max_iterations=8, tol_x=0.02, tol_f=1e-5)
+_OPTIMISER = LevenbergMarquardt(max_iterations=15, tol_x=0.02, tol_f=1e-5)
 _SCALE = (0.03, 0.03, 0.03, 1.0, 1.0, 3.0)  # rad and mm: one unit of a motion
-_APART_MM = 2.5  # what lies nearer is the device itself
+_APART_MM = 3.0  # what lies nearer, or nearer than the device is wide (root mean square), is the device itself
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def _look(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Besid
 
 
 def rival(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -> Rival | None:
-    """The best other place of a device within 30 mm across its long axis, by images of a `kind`; all else stays.
+    """The best other place of a device, up to 24 mm along both axes across it, by images of a `kind`; all else stays.
 
     None where none of the best few starts ends elsewhere.
     """
@@ -106,17 +108,19 @@ def rival(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -
     filled = (thing.volume.data > _INSIDE * thing.volume.data.max()).nonzero().cpu()
     filled = filled[:: 1 + len(filled) // _MOST_POINTS].flip(1).double()
     points = transform_points(pose @ thing.volume.lps_from_index, filled)
-    axes = torch.linalg.eigh((points - points.mean(0)).T @ (points - points.mean(0))).eigenvectors  # the last is long
+    away = points - points.mean(0)
+    moments, axes = torch.linalg.eigh(away.T @ away / len(points))  # the last is long
+    apart = max(_APART_MM, math.sqrt(moments[1]))
     centre, scale = reference_point_in_view(scene, poses, name, 0), torch.tensor(_SCALE, dtype=torch.float64)
     body = Body((name,), 0, centre, scale)
     images = scene.there([kind], range(scene.views))
     costs = image_costs(scene, poses, (body,), tuple(poses.camera1_from), images, _LEVEL, _SIMILARITY, imaging=imaging)
     here = float(costs(costs.still[None]).mean())
     gain = float(costs.without_what_moves().mean()) - here
-    deltas = torch.zeros(len(_places()), 6, dtype=torch.float64)
-    deltas[:, 3:] = _places() @ axes[:, :2].T / scale[3:]
     found: list[Rival] = []
-    for start in _apart(deltas[costs(deltas).mean(1).argsort()], scale):
+    for place in _lowest(lambda deltas: costs(deltas).mean(1), axes[:, :2], scale):
+        start = torch.zeros(6, dtype=torch.float64)
+        start[3:] = axes[:, :2] @ place / scale[3:]
         begun = moved(poses, (body,), start)
         again = Body((name,), 0, reference_point_in_view(scene, begun, name, 0), scale)
         there = image_costs(
@@ -124,27 +128,23 @@ def rival(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -
         )
         result = _OPTIMISER.minimise(stage_objective(there, (again,), None), 6, seed=0)
         ended = moved(begun, (again,), result.delta).camera1_from[name]
-        away = transform_points(ended @ thing.volume.lps_from_index, filled).mean(0) - points.mean(0)
-        across = float((away @ axes[:, :2]).norm())
-        if across > _APART_MM:
+        moved_by = transform_points(ended @ thing.volume.lps_from_index, filled).mean(0) - points.mean(0)
+        across = float((moved_by @ axes[:, :2]).norm())
+        if across > apart:
             found.append(Rival(across, (gain + here - result.value) / gain))
     return max(found, key=lambda each: each.share, default=None)
 
 
-def _places() -> Tensor:
-    """Places (N, 2) on a grid, mm across."""
+def _lowest(cost: Callable[[Tensor], Tensor], across: Tensor, scale: Tensor) -> list[Tensor]:
+    """The best few places (2,), mm along two axes `across` (3, 2), that fit better than all around them.
+
+    Where views look nearly alike, similarity falls slowly along the depth; places on that slope lead back.
+    """
     steps = torch.arange(-_FARTHEST_MM, _FARTHEST_MM + _STEP_MM, _STEP_MM, dtype=torch.float64)
     places = torch.cartesian_prod(steps, steps)
-    away = places.norm(dim=1)
-    return places[(away >= _NEAREST_MM) & (away <= _FARTHEST_MM)]
-
-
-def _apart(ordered: Tensor, scale: Tensor) -> list[Tensor]:
-    """The first few of deltas (N, 6) that lie 2 grid steps and more from one another."""
-    kept: list[Tensor] = []
-    for delta in ordered:
-        if all(float(((delta - other) * scale)[3:].norm()) > 2 * _STEP_MM for other in kept):
-            kept.append(delta)
-        if len(kept) == _STARTS:
-            break
-    return kept
+    deltas = torch.zeros(len(places), 6, dtype=torch.float64)
+    deltas[:, 3:] = places @ across.T / scale[3:]
+    costs = cost(deltas).view(1, len(steps), len(steps))
+    lowest = (costs <= -F.max_pool2d(-costs, 3, 1, 1)).flatten() & (places.norm(dim=1) >= _NEAREST_MM)
+    order = costs.flatten().masked_fill(~lowest, math.inf).argsort()
+    return list(places[order[: min(_STARTS, int(lowest.count_nonzero()))]])

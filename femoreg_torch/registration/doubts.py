@@ -68,8 +68,9 @@ _SURE_OF_BREAK = 4.0
 # label maps too, at most 0.0003.
 _LEAST_GAIN_OF_BEND = 0.0002
 _GAIN_OF_BREAK, _APART_OF_BREAK_MM = 0.0008, 0.8
-# Another place of a device, of the similarity that it adds where it was found: of a wire beside an equal one 1.07.
-_AS_GOOD_ELSEWHERE = 0.6
+# Another place of a device, of the similarity that it adds where it was found: of a wire beside an equal one 1.07,
+# beside a thicker one 0.5; of a wire alone, and of one beside cement, less than nothing.
+_AS_GOOD_ELSEWHERE = 0.4
 
 
 def doubts(

@@ -28,12 +28,11 @@ def shadow(volume: Volume, poses: Poses, name: str, view: int) -> Tensor:
     return F.avg_pool2d(image[None], 2)[0, 0]
 
 
-def with_two_rods() -> Scene:
-    """A rod for the device, and in its images another one, 20 mm beside it."""
+def with_rods(*places: Poses) -> Scene:
+    """A rod for the device, and in its images one at each place."""
     scene = make_scene(TRUTH)
-    both = TRUTH, TRUTH.with_object("device", ASIDE)
     images = tuple(
-        scene.image("anatomy", view) + torch.stack([shadow(ROD, poses, "device", view) for poses in both]).sum(0)
+        scene.image("anatomy", view) + torch.stack([shadow(ROD, poses, "device", view) for poses in places]).sum(0)
         for view in range(3)
     )
     rod = replace(scene.objects["device"], volume=ROD)
@@ -41,7 +40,7 @@ def with_two_rods() -> Scene:
 
 
 def with_cement(kind: str) -> Scene:
-    scene = make_scene(TRUTH)
+    scene = with_rods(TRUTH)
     images = tuple(scene.image(kind, view) + shadow(CEMENT, TRUTH, "femur", view) for view in range(3))
     return replace(scene, images=scene.images | {kind: images})
 
@@ -61,7 +60,7 @@ def test_exposures_that_differ_are_nothing_beside_it() -> None:
 
 @pytest.mark.parametrize("at", [TRUTH.camera1_from["device"], ASIDE])
 def test_a_twin_is_told_from_either_of_the_two(at: Tensor) -> None:
-    scene = with_two_rods()
+    scene = with_rods(TRUTH, TRUTH.with_object("device", ASIDE))
     poses = TRUTH.with_object("device", at)
     found = rival(scene, poses, "device", "device", PLAIN)
     assert found is not None
