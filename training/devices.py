@@ -8,11 +8,11 @@ from torch import Tensor
 
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera
 from femoreg_torch.tensors import read_metadata, read_tensors, write_tensors
 from sim.labelled.devices_in_view import device_pose
 from sim.labelled.settings import DeviceRanges
-from sim.labelled.tensor_files import tensor_file
 from sim.physics.line_integrals import device_density
 from sim.theatre.device import make_device
 
@@ -44,7 +44,7 @@ def render_devices(path: Path, count: int, camera: Camera, seed: int) -> Path:
         which = n % _RANGES.count
         pose = device_pose(*made[which], _RANGES, rng)
         shadows.append(project([densities[which]], pose[None, None], camera, _STEP_MM)[0] / 10 * _CM2_PER_G)
-    with tensor_file(path) as part:
+    with temporary_file(path) as part:
         write_tensors(part, {"shadows": torch.stack(shadows).half()}, {"source": source})
     return path
 

@@ -26,9 +26,8 @@ from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import load_network
 from femoreg_torch.detect.grid import NETWORK_SIZE
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import clear_leftovers, write_json
+from femoreg_torch.files import clear_leftovers, temporary_file, write_json
 from models.weights import SHIPPED_WEIGHTS, Weights, save_weights
-from sim.labelled.tensor_files import tensor_file
 from training.checkpoints import WholeCheckpoints, last_good_checkpoint, read_checkpoint
 from training.cohort import render_cohort
 from training.curves import draw_curves
@@ -203,6 +202,6 @@ def export_weights(checkpoint: Path, settings: TrainingSettings, path: Path) -> 
         "data": json.dumps(data),
         "loss": json.dumps(known["loss"]),
     }
-    with tensor_file(path) as part:
+    with temporary_file(path) as part:
         save_weights(part, weights, about)
     return path

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
+from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera, carm_from_dict, load_carm
 from femoreg_torch.tensors import check_shapes, read_metadata, read_tensors, write_tensors
 from femoreg_torch.text import json_content
@@ -33,7 +34,6 @@ from sim.labelled.devices_in_view import make_devices
 from sim.labelled.imaged_patient import ImagedPatient, read_imaged_patient
 from sim.labelled.physics_views import render_physics
 from sim.labelled.settings import LabelledSettings, load_labelled_settings
-from sim.labelled.tensor_files import tensor_file
 from sim.labelled.view_poses import FEMORAL_HEADS
 from sim.physics.fluoroscopy import XrayModel
 
@@ -131,7 +131,7 @@ def write_labelled(path: Path, content: LabelledImages) -> None:
         "camera": json.dumps(asdict(content.camera)),
         "xray": json.dumps(content.xray_names),
     }
-    with tensor_file(path) as part:
+    with temporary_file(path) as part:
         write_tensors(part, {name: getattr(content, name).contiguous() for name in _TENSORS}, metadata)
 
 

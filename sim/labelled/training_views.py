@@ -18,12 +18,12 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.drr import project
+from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera, project_points, transform_points
 from femoreg_torch.tensors import write_tensors
 from femoreg_torch.volume import Volume
 from sim.labelled.attenuation_layers import Layers
 from sim.labelled.class_images import class_image, left_is_nearer
-from sim.labelled.tensor_files import tensor_file
 from sim.labelled.view_poses import LabelledPose, ViewRanges, sample_pose
 
 _STEP_MM = 1.5
@@ -74,5 +74,5 @@ def write_views(
         "labels": torch.stack([view.labels for view in views]),
         "landmarks": torch.stack([view.landmarks for view in views]),
     }
-    with tensor_file(path) as part:
+    with temporary_file(path) as part:
         write_tensors(part, content, {"source": source})

@@ -84,7 +84,7 @@ def test_a_broken_object_is_doubted_by_as_much_as_it_is_bent(scene: Scene, name:
 def test_a_break_that_is_small_and_yet_explains_the_images_is_doubted(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A neck that broke by 6° was 1.3 mm apart, less than what limits alone told, and gained ten times as much as
+    """A neck that broke by 6° was 1.3 mm apart, less than what limits alone told, and gained eight times as much as
     unbroken ones."""
     motion = torch.tensor([4.0, 0, 0, 0.5, 0, 0], dtype=torch.float64)
     for apart, gain, told in ((1.3, 0.0012, 1), (1.3, 0.0003, 0), (0.5, 0.0012, 0)):

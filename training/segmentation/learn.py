@@ -24,7 +24,6 @@ from femoreg_torch.segment.network import network_input, padded_to
 from femoreg_torch.settings import SEEDS, check_within, read_record
 from models.volume_unet import VolumeUNetSettings
 from models.weights import Weights, save_weights
-from sim.labelled.tensor_files import tensor_file
 from training.segmentation.scans import Scan, ScanSettings, random_scan
 from training.segmentation.shapes import BoneShape, cached_shapes
 
@@ -195,7 +194,7 @@ def export_segmentation(
         "held_out": json.dumps(names["held_out"]),
         "seed": str(settings.seed),
     }
-    with tensor_file(path) as part:
+    with temporary_file(path) as part:
         save_weights(part, Weights("volume_unet", content, HIP.name, 0.0, state), about)
 
 
