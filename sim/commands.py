@@ -94,7 +94,7 @@ def simulate(
     """Simulate the six-image acquisition of the paper: a complete case folder with its truth.
 
     Args:
-        case: Folder with ct.nii.gz, labels.nii.gz and landmarks.json, or with a case.yaml.
+        case: Folder with a case.yaml, or with ct.nii.gz, labels.nii.gz and landmarks.json.
         out: Case folder to write.
         seed: The same seed gives the same poses and the same images.
         side: Hip to be operated; that of case.yaml, or the left one, if not given.
@@ -146,7 +146,7 @@ def labelled_images(
     """Render labelled fluoroscopy of one patient, with true poses, for `femoreg measure`.
 
     Args:
-        patient: Folder with ct.nii.gz, labels.nii.gz and landmarks.json.
+        patient: Folder with a case.yaml, or with ct.nii.gz, labels.nii.gz and landmarks.json.
         out: File to write, `.safetensors`; a few seconds for an image.
         count: Number of views.
         seed: The same seed gives the same views.

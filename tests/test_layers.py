@@ -29,7 +29,7 @@ ROOMS = (
     "configs", "settings", "extensions",
     "anatomy", "geometry", "volume", "segment", "drr", "fluoro", "case",
     "detect", "pnp", "similarity", "optimize", "registration", "navigation", "neighbours", "planning",
-    "evaluation", "review", "beads", "intake", "statistics", "commands",
+    "evaluation", "review", "beads", "intake", "statistics", "commands", "__main__",
 )  # fmt: skip
 
 

@@ -86,7 +86,8 @@ def render_cohort(
     """The views to train on and to validate on, rendered into `cache` unless they are there.
 
     `cases` are folders as `sim.labelled.patient_folders` reads them; those whose files have changed since are rendered
-    anew. Raises `InputError` if two of them have one name, or the cache holds views made with other settings.
+    anew, and so are procedural patients whose CT has another voxel size. Raises `InputError` if two cases have one
+    name, or the cache holds views made with other settings.
     """
     _check_names(cases)
     given = [_of_case(case, settings, report) for case in cases]  # complains before anything is rendered
@@ -127,7 +128,8 @@ def _of_case(folder: Path, settings: CohortSettings, report: Callable[[str], Non
 def _procedural(seed: int, settings: CohortSettings) -> Source:
     name = f"patient{seed}"
     make = partial(_make_patient, seed, settings.patient_spacing_mm)
-    return Source(name, name, {"patient": name}, settings.patient_variants, make)
+    told = {"patient": name, "spacing_mm": f"{settings.patient_spacing_mm:g}"}
+    return Source(name, name, told, settings.patient_variants, make)
 
 
 def _read_case(name: str, files: PatientFiles, report: Callable[[str], None]) -> Layers:
@@ -146,7 +148,7 @@ def _make_patient(seed: int, spacing_mm: float) -> Layers:
 
 
 def _variants(settings: CohortSettings, cache: Path, source: Source, report: Callable[[str], None]) -> list[Path]:
-    """The files of all variants of one patient, rendered where they are missing or of files that have changed since."""
+    """The files of all variants of one patient, rendered where they are missing or of another CT than it has now."""
     files = [cache / f"{source.file}_{variant:02d}.safetensors" for variant in range(source.variants)]
     how = {key: value for key, value in asdict(settings).items() if key in _RENDERED}
     written = json.dumps({**source.told, **how})

@@ -111,7 +111,9 @@ def _folder(path: Path, series: str | None) -> Findings:
     if series is None and len(volumes) != 1:
         if len(there) == 1 and there[0].modality == "SEG":
             return _segmentation(path)
-        hint = "choose one with --series" if volumes else "none of them is a volume; give one file to see an image"
+        hint = "none of them is a volume; give one file to see an image"
+        if volumes:
+            hint = "choose one with --series: its number, its UID or a part of its name"
         return Findings("DICOM folder", (*facts, hint))
     found = _volume(path, series)
     return Findings("DICOM folder", (*facts, *found.facts), found.warnings, found.picture)

@@ -14,13 +14,15 @@ from femoreg_torch.case import Case
 from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.fluoro import Display
-from femoreg_torch.geometry import Poses, orbit_angles, pose_difference, transform_points
+from femoreg_torch.geometry import Poses, pose_difference, transform_points
 from femoreg_torch.registration.besides import besides, rival
 from femoreg_torch.registration.calibration import devices
 from femoreg_torch.registration.covariance import PoseCovariance
 from femoreg_torch.registration.handedness import handedness
 from femoreg_torch.registration.imaging import Imaging
+from femoreg_torch.registration.misfits import misfits
 from femoreg_torch.registration.motion import MotionBetween
+from femoreg_torch.registration.orbit import orbits
 from femoreg_torch.registration.quality import Limits, shift_px
 from femoreg_torch.registration.rigidity import CUTS, bend
 from femoreg_torch.registration.scene import Scene
@@ -77,9 +79,12 @@ def doubts(
 ) -> tuple[str, ...]:
     """All that speaks against a result besides the quality of its objects, in words.
 
-    `told` is the scene as the case tells it, `scene` the one with what was estimated of the images.
+    `told` is the scene as the case tells it, `scene` the one with what was estimated of the images. Where an image does
+    not fit at all, nothing else that the images would say is asked.
     """
     displays = [case.display_of(view) for view in range(len(case.views))]
+    if strange := doubts_about_the_images(scene, poses, imaging):
+        return (*strange, *doubts_about_the_plan(case, scene), *doubts_about_the_guide(case, poses))
     others: list[Callable[[], tuple[str, ...]]] = [
         lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
@@ -95,6 +100,36 @@ def doubts(
         *doubts_about_rigidity(scene, poses, imaging),
     )
     return (*found, *doubts_beside_devices(scene, poses, imaging, bool(found)))
+
+
+def doubts_about_the_images(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
+    """Images that do not show what is drawn for them, and the likely reason, in words."""
+    told = []
+    for found in misfits(scene, poses, imaging):
+        what = f"the {found.kind} image of view {found.view + 1}"
+        beside = f"(similarity {found.similarity:.2f}, of view 1 {found.in_view_1:.2f})"
+        if found.as_view is not None:
+            told.append(
+                f"{what} shows what the other images of view {found.as_view + 1} show {beside}: are images exchanged? "
+                "Check `views` of the case"
+            )
+        elif found.as_stored is not None:
+            told.append(
+                f"{what} fits nowhere as the case tells it, and {found.as_stored} it does {beside}: check `display` of "
+                "the case"
+            )
+        elif found.kind != scene.first_kind:
+            told.append(
+                f"{what} does not show what the other image of that view shows {beside}: check that both were taken "
+                "without moving C-arm or patient, and that no images are exchanged"
+            )
+        else:
+            told.append(
+                f"{what} fits nowhere within {_ORBIT_DEG:.0f}° of view 1 {beside}: check that it shows the same hip of "
+                "the same patient, and that little covers it; a C-arm that stood elsewhere needs its poses "
+                "(`camera_from_camera1` of the views)"
+            )
+    return tuple(told)
 
 
 def doubts_beside_devices(scene: Scene, poses: Poses, imaging: Imaging, in_doubt: bool) -> tuple[str, ...]:
@@ -175,10 +210,10 @@ def doubts_about_the_carm(
 
 
 def doubts_about_the_views(scene: Scene, poses: Poses) -> tuple[str, ...]:
-    """Views whose C-arm was found where its orbit does not lead, in words; none where its poses are given."""
+    """Views whose C-arm was found where no orbit leads, in words; none where its poses are given."""
     if scene.camera_from_camera1 is not None:
         return ()
-    orbit = scene.carm.orbit(orbit_angles(_ORBIT_DEG, 1.0))
+    orbit = orbits(scene, poses, _ORBIT_DEG, 1.0)
     isocentre = torch.tensor(scene.carm.isocentre_mm, dtype=torch.float64)
     told = []
     for view, found in enumerate(poses.camera_from_camera1[1:], 2):

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -30,6 +30,7 @@ from femoreg_torch.similarity import Similarity, shift_correlation
 # Angles that are looked at with the similarity itself. In 16 views of eight cases, 1.1 to 1.4 degrees and up to 24 mm
 # off the orbit, the best of all was among the first four.
 _MOST_SHIFTED = 12
+_FURTHER_SHIFT = 2.0  # times `shift_mm`, away from the range of the orbit
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,9 @@ class OrbitSearch:
     all. With `shift_mm`, what is drawn may lie so far, up, down and to the sides, from where the orbit has it: a C-arm
     that was rolled or a table that was moved between the views leaves the orbit by a centimetre or two, more than a
     similarity of patches bridges.
+
+    A view whose best cost is above `further_above` is looked for further, up to `further_deg` along the orbit, and
+    along the orbits on which what stands in the middle of view 1 stays there: many users centre the hip again.
     """
 
     name: str
@@ -50,9 +54,19 @@ class OrbitSearch:
     level: Level
     similarity: Similarity
     shift_mm: float = 0.0
+    further_deg: float = 0.0  # 0: not at all
+    further_above: float = 0.0
 
     def __post_init__(self) -> None:
-        check_within(self, half_range_deg=(0, 180), step_deg=(0.01, 180), shift_mm=(0, 200))
+        degrees = (0, 180)
+        check_within(
+            self,
+            half_range_deg=degrees,
+            step_deg=(0.01, 180),
+            shift_mm=(0, 200),
+            further_deg=degrees,
+            further_above=(0, 10),
+        )
 
     def left_out(self, scene: Scene, poses: Poses) -> str | None:
         """Why it has nothing to do, see `Step`. Raises `InputError` without the images that it needs."""
@@ -86,23 +100,58 @@ def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> 
     """Place the C-arm of one view (from 0) at the angle of its orbit, from view 1, that fits its images best."""
     began = time.perf_counter()
     orbit = scene.carm.orbit(orbit_angles(search.half_range_deg, search.step_deg))  # (N, 4, 4)
-    tried = _shifted(scene, poses, search, view, orbit) if search.shift_mm else orbit
+    found = _best(scene, poses, search, view, orbit, search.shift_mm)
+    tries = found.tries
+    if search.further_deg and found.cost > search.further_above:
+        around = orbits(scene, poses, search.further_deg, search.step_deg)
+        further = _best(scene, poses, search, view, around, _FURTHER_SHIFT * search.shift_mm)
+        tries += further.tries
+        found = min(found, further, key=lambda each: each.cost)
+    return StageRecord(
+        search.name,
+        view + 1,
+        found.cost,
+        tries,
+        time.perf_counter() - began,
+        "all angles tried",
+        poses.with_view(view, found.camera_from_camera1),
+    )
+
+
+def orbits(scene: Scene, poses: Poses, half_range_deg: float, step_deg: float) -> Tensor:
+    """Poses (N, 4, 4) of the C-arm from view 1: along its orbit, and along that about the middle of view 1.
+
+    In the middle, on the central ray, stands what has its reference point nearest to it. Who centres the hip again
+    after the turn brings it back there, whatever the C-arm turned about.
+    """
+    points = [
+        transform_points(pose, scene.objects[name].reference_point[None])[0]
+        for name, pose in poses.camera1_from.items()
+        if scene.first_kind in scene.objects[name].shown_in
+    ]
+    middle = min(points, key=lambda point: float(point[:2].norm() / point[2]))
+    about_middle = replace(scene.carm, isocentre_mm=(0.0, 0.0, float(middle[2])))
+    angles = orbit_angles(half_range_deg, step_deg)
+    return torch.cat([scene.carm.orbit(angles), about_middle.orbit(angles)])
+
+
+@dataclass(frozen=True)
+class _Best:
+    cost: float
+    camera_from_camera1: Tensor  # (4, 4)
+    tries: int
+
+
+def _best(scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: Tensor, shift_mm: float) -> _Best:
+    """Which of the poses (N, 4, 4) of the C-arm fits the images of a view best, each shifted by so much at most."""
+    tried = _shifted(scene, poses, search, view, orbit, shift_mm) if shift_mm else orbit
     costs = [
         prepared(scene, image, search.level, search.similarity)(_drawn(scene, poses, search, image, tried))
         for image in search.images(scene, poses, view)
     ]
     values = torch.stack(costs).mean(0).cpu()  # (N,)
     best = int(values.nan_to_num(nan=torch.inf, posinf=torch.inf).argmin())
-    seconds = time.perf_counter() - began
-    return StageRecord(
-        search.name,
-        view + 1,
-        float(values[best]),
-        len(orbit) + (len(tried) if search.shift_mm else 0),
-        seconds,
-        "all angles tried",
-        poses.with_view(view, tried[best]),
-    )
+    return _Best(float(values[best]), tried[best], len(orbit) + (len(tried) if shift_mm else 0))
 
 
 def _drawn(scene: Scene, poses: Poses, search: OrbitSearch, image: tuple[Kind, int], cameras: Tensor) -> Tensor:
@@ -115,7 +164,7 @@ def _drawn(scene: Scene, poses: Poses, search: OrbitSearch, image: tuple[Kind, i
     return project(volumes, where, camera, search.level.step_mm)
 
 
-def _shifted(scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: Tensor) -> Tensor:
+def _shifted(scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: Tensor, shift_mm: float) -> Tensor:
     """The poses (n, 4, 4) of the orbit whose images fit best once shifted, shifted so."""
     images = search.images(scene, poses, view)
     camera = poses.camera(view, search.level.camera(scene.carm.camera))
@@ -123,7 +172,7 @@ def _shifted(scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: 
     point = transform_points(poses.camera1_from[name], scene.objects[name].reference_point[None])
     depth_mm = transform_points(orbit, point)[:, 0, 2]  # (N,)
     mm_per_pixel = depth_mm[:, None] / camera.sdd_mm * torch.tensor(camera.pixel_mm, dtype=torch.float64)  # (N, 2)
-    rows, columns = (search.shift_mm / mm_per_pixel.mean(0)).ceil().int().tolist()
+    rows, columns = (shift_mm / mm_per_pixel.mean(0)).ceil().int().tolist()
     maps = [
         shift_correlation(
             _drawn(scene, poses, search, image, orbit),

@@ -195,8 +195,8 @@ def choose_series(path: Path, wanted: str | None = None) -> Series:
     if not chosen:
         raise InputError(f"{folder}: none of its DICOM series is a volume; there are: {listed}. Choose another folder.")
     raise InputError(
-        f"{folder}: holds {len(chosen)} DICOM series, one was expected: {listed}. Choose one: `--series NUMBER` of "
-        "`femoreg new-case`, or in case.yaml the path of one of its files."
+        f"{folder}: holds {len(chosen)} DICOM series, one was expected: {listed}. Choose one: by its number, its UID "
+        "or a part of its name, `--series` of `femoreg new-case`, or by the path of one of its files in case.yaml."
     )
 
 

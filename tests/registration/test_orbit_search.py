@@ -1,10 +1,11 @@
 """The search along the orbit, of C-arms that left it."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from registration_scenes import REFERENCE_POINTS, error, float64, make_scene, true_poses
+from registration_scenes import CARM, REFERENCE_POINTS, error, float64, make_scene, true_poses
 
 from femoreg_torch.geometry import Poses, about_point, exp_se3, transform_points
 from femoreg_torch.registration import Level, OrbitSearch
@@ -51,3 +52,26 @@ def test_a_view_on_the_orbit_is_found_as_well() -> None:
         )
         assert mm < 7
         assert deg < 2
+
+
+@pytest.mark.parametrize(("angle_deg", "centred"), [(72.0, False), (-85.0, False), (80.0, True), (-30.0, True)])
+def test_a_view_from_far_off_is_found(angle_deg: float, centred: bool) -> None:
+    """Beyond the range of the orbit, and where the patient was centred anew, 100 mm from where the orbit has it."""
+    poses = true_poses()
+    depth = float(transform_points(poses.camera1_from["femur"], REFERENCE_POINTS["femur"][None])[0, 2])
+    carm = replace(CARM, isocentre_mm=(0.0, 0.0, depth)) if centred else CARM
+    truth = poses.with_view(1, carm.orbit(float64(math.radians(angle_deg))))
+    scene = make_scene(truth, with_device=False)
+    search = replace(SEARCH, shift_mm=30.0, further_deg=100.0, further_above=0.6)
+    found = search_orbit(scene, truth.with_view(1, torch.eye(4, dtype=torch.float64)), search, 1)
+    mm, deg = error(found.poses.camera_from("pelvis")[1], truth.camera_from("pelvis")[1], REFERENCE_POINTS["pelvis"])
+    assert mm < 25  # along the beam
+    assert deg < 3
+    assert found.evaluations == 81 + 12 + 2 * 201 + 12
+
+
+def test_a_view_that_fits_is_looked_for_no_further() -> None:
+    truth = true_poses()
+    scene = make_scene(truth, with_device=False)
+    search = replace(SEARCH, further_deg=100.0, further_above=0.95)
+    assert search_orbit(scene, truth, search, 1).evaluations == 81

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -121,6 +122,24 @@ def test_an_edited_case_is_rendered_anew(case: Path, tmp_path: Path, name: str) 
     changed = [file.stat().st_mtime_ns != time for file, time in zip(files, before, strict=True)]
     assert changed == [True, True, False, False]
     assert rendered([mine, other], cache) == (files, [])
+
+
+def test_procedural_patients_of_another_voxel_size_are_rendered_anew(
+    case: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+
+    def make(_seed: int, spacing_mm: float) -> Layers:
+        asked.append(spacing_mm)
+        ct = read_ct(case / "ct.nii.gz")
+        return split_layers(ct, read_labels(case / "labels.nii.gz", ct), read_landmarks(case / "landmarks.json"))
+
+    monkeypatch.setattr(training.cohort, "_make_patient", make)
+    coarse = CohortSettings(patient_seeds=[1], validation_seeds=[], patient_spacing_mm=2, patient_variants=1, views=1)
+    cache = tmp_path / "cache"
+    for settings in (coarse, coarse, replace(coarse, patient_spacing_mm=1)):
+        rendered([], cache, settings)
+    assert asked == [2, 1]
 
 
 def test_an_edited_ct_shows_in_the_views(case: Path, tmp_path: Path) -> None:
