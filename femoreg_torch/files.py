@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -116,6 +116,20 @@ def check_new_folder(path: Path, source: Path | None = None) -> Path:
 
     Raises `InputError` as `new_folder` does, where nothing may be written, and for the folder `source` that is read.
     """
+    real = check_folder(path)
+    if real.exists() and source is not None and source.exists() and real.samefile(source):
+        raise InputError(f"{real}: is the folder that is read. Choose another one for the output.")
+    if real.is_mount():
+        raise InputError(f"{real}: is a mount point, which cannot be replaced as a whole. Choose a folder inside it.")
+    return real
+
+
+def check_folder(path: Path, sources: Iterable[Path] = ()) -> Path:
+    """The real path of a folder that is there, or can be made, to add files to.
+
+    Raises `InputError` where there is a file, where nothing may be written, and for a folder that is, or lies in, one
+    of `sources`, which are read.
+    """
     try:
         real = path.resolve()  # so that the name and the parent of `.` and `out/..` are real ones
         there = real.exists()
@@ -123,10 +137,9 @@ def check_new_folder(path: Path, source: Path | None = None) -> Path:
         raise InputError(f"{shortened(path, 200)}: cannot be written ({shortened(error, 100)}).") from error
     if there and not real.is_dir():
         raise InputError(f"{real}: is a file, a folder was expected. Choose another name for the output.")
-    if there and source is not None and source.exists() and real.samefile(source):
-        raise InputError(f"{real}: is the folder that is read. Choose another one for the output.")
-    if there and real.is_mount():
-        raise InputError(f"{real}: is a mount point, which cannot be replaced as a whole. Choose a folder inside it.")
+    for source in sources:
+        if real.is_relative_to(source.resolve()):
+            raise InputError(f"{real}: lies in {source}, which is read. Choose another folder for the output.")
     missing, above = next((n, parent) for n, parent in enumerate(real.parents) if parent.exists())
     names = [real.name, *(parent.name for parent in real.parents[:missing])]
     if missing > _MOST_NEW or any(len(os.fsencode(name)) > _LONGEST_NAME for name in names):
@@ -134,6 +147,26 @@ def check_new_folder(path: Path, source: Path | None = None) -> Path:
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         raise InputError(f"{real}: cannot be written, {above} is no folder or not yours. Choose another place.")
     return real
+
+
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Raises `InputError` if another process is in such a block with the same folder; a killed one is in it no more.
+
+    The folder itself is locked. Where a file system has no locks, or none for folders, nobody is refused.
+    """
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(lock)
+        raise InputError(f"{folder}: another command is writing there. Wait, or choose another --out.") from None
+    except OSError:  # no locks there
+        pass
+    try:
+        yield
+    finally:
+        os.close(lock)
 
 
 def _keep_others(old: Path, built: Path, without: Collection[str]) -> None:

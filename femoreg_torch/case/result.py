@@ -55,6 +55,7 @@ class Result:
     seed: int = 0
     versions: dict[str, str] = field(default_factory=dict)
     errors: dict[str, Any] | None = None  # against the case's truth, where it has one: see `femoreg_torch.evaluation`
+    inputs: str = ""  # digest of all that it was made of, see `case/inputs.py`
     case: str | None = None  # the case's folder, seen from that of the result
     doubts: tuple[str, ...] = ()  # what speaks against it besides the quality of its objects
 

@@ -49,6 +49,8 @@ def result_content(result: Result) -> dict[str, Any]:
         "seed": result.seed,
         "versions": result.versions,
     }
+    if result.inputs:
+        content["inputs"] = result.inputs
     if result.errors is not None:
         content["errors"] = result.errors
     if result.case is not None:
@@ -113,6 +115,7 @@ def read_result(run: Path) -> Result:
         preset=str(top.content.get("preset", "")),
         seed=top.whole("seed", 0, 2**63 - 1) if "seed" in top else 0,
         versions={str(key): str(value) for key, value in _mapping(top, "versions").items()},
+        inputs=str(top.content.get("inputs", "")),
         errors=_mapping(top, "errors") if "errors" in top else None,
         case=top.text("case", "a folder") if "case" in top else None,
         doubts=tuple(_doubts(top)),

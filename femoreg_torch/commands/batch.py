@@ -52,8 +52,9 @@ def batch(
 
     The run of each case is written to OUT/NAME, where NAME is that of its folder, as `femoreg register` writes it, as
     soon as it is done. Started again after it was killed, the command goes on with the cases that are missing: what
-    was registered by the same preset, seed and versions since the case was last changed is kept. A case that is refused
-    does not stop the others. The table is OUT/table.csv. Status 2 if a case was refused or failed.
+    was registered by the same versions and seed, and from files of the same content (case, CT, images, models, plan,
+    preset, weights, wherever they lie), is kept. A case that is refused does not stop the others. OUT/table.csv tells
+    the cases of this command. Status 2 if a case was refused or failed.
 
     Args:
         cases: Case folders, each with case.yaml.
@@ -70,21 +71,22 @@ def batch(
 
     from femoreg_torch.commands.status import BAD_INPUT, DONE, NOT_TRUSTED
     from femoreg_torch.commands.telling import progress_report, tell_device
-    from femoreg_torch.files import clear_leftovers
+    from femoreg_torch.files import clear_leftovers, only_writer
 
     console = Console()
     waiting = _jobs(cases, out, preset, seed, weights, jobs, tell_device(console, device).type)
     out.mkdir(parents=True, exist_ok=True)
-    clear_leftovers(out)
-    rows = {} if again else {job.case: row for job in waiting if (row := kept(job)) is not None}
-    left = [job for job in waiting if job.case not in rows]
-    with progress_report(console, f"{len(left)} cases") as report:
+    with only_writer(out), progress_report(console, "looking for earlier runs") as report:
+        clear_leftovers(out)
+        rows = {} if again else {job.case: row for job in waiting if (row := kept(job)) is not None}
+        left = [job for job in waiting if job.case not in rows]
+        report(f"{len(left)} cases", 0)
         for done, (job, row) in enumerate(run_jobs(left, jobs), 1):
             rows[job.case] = row
             report(f"{done} of {len(left)}: {row.case} {row.status}", done / len(left))
             _write_table([rows[job.case] for job in waiting if job.case in rows], out / "table.csv")
-    table = [rows[job.case] for job in waiting]
-    _write_table(table, out / "table.csv")
+        table = [rows[job.case] for job in waiting]
+        _write_table(table, out / "table.csv")
     _tell(console, table)
     console.print(f"Table written to {out / 'table.csv'}.", markup=False)
     if any(row.status in ("refused", "failed") for row in table):
@@ -95,15 +97,24 @@ def batch(
 def _jobs(
     cases: Sequence[Path], out: Path, preset: str, seed: int, weights: Path | None, count: int, device: str
 ) -> list[Job]:
-    """What is to be done. Raises `InputError` for cases that would be written to one place, and for no jobs."""
+    """What is to be done. Raises `InputError` for what would be refused case by case, or written where it must not be.
+
+    That is a preset or weights that cannot be read, cases of one name, no jobs, and a place for the runs that is a file
+    or lies in a case.
+    """
     import os
 
+    from femoreg_torch.detect import load_network
     from femoreg_torch.errors import InputError, shortened
+    from femoreg_torch.files import check_folder
     from femoreg_torch.registration import load_plan
 
     if count < 1:
         raise InputError(f"--jobs: at least 1 was expected, got {count}.")
+    check_folder(out, cases)
     load_plan(preset)  # complains once, not for every case
+    if weights is not None:
+        load_network(weights)
     names = [case.resolve().name for case in cases]
     for name in names:
         if names.count(name) > 1:
@@ -111,30 +122,31 @@ def _jobs(
                 f"{names.count(name)} cases are called {shortened(name)}: their runs would be one folder. Rename them."
             )
     threads = max(1, len(os.sched_getaffinity(0)) // count)
-    return [
+    waiting = [
         Job(case, out / name, preset, seed, weights, threads, device) for case, name in zip(cases, names, strict=True)
     ]
+    for job in waiting:
+        check_folder(job.out, [job.case])
+    return waiting
 
 
 def kept(job: Job) -> Row | None:
-    """The row of a run that is there already; None if it is to be made, as case or settings have changed since."""
-    from femoreg_torch.case import RESULT_NAME, read_result
+    """The row of a run that is there already; None if it is to be made, as it was made of other files or settings."""
+    from femoreg_torch.case import RESULT_NAME, read_case, read_result
+    from femoreg_torch.commands.register import inputs_of
     from femoreg_torch.errors import InputError
-    from femoreg_torch.registration import load_plan
     from femoreg_torch.registration.run import versions
 
-    path = job.out / RESULT_NAME
-    if not path.is_file():
+    if not (job.out / RESULT_NAME).is_file():
         return None
     try:
         result = read_result(job.out)
+        if (result.preset, result.seed, result.versions) != (job.preset, job.seed, versions()):
+            return None
+        inputs = inputs_of(read_case(job.case), job.preset, job.weights)
     except InputError:
-        return None  # of another version, or broken: it is made anew
-    if (result.preset, result.seed, result.versions) != (load_plan(job.preset).preset, job.seed, versions()):
-        return None
-    sources = [*job.case.rglob("*"), Path(job.preset), *([job.weights] if job.weights else [])]
-    changed = max((file.stat().st_mtime for file in sources if file.is_file()), default=float("inf"))
-    return _row(job, "kept", result) if changed <= path.stat().st_mtime else None
+        return None  # a result of another version, or broken: it is made anew; of a broken case its run tells
+    return _row(job, "kept", result) if result.inputs == inputs else None
 
 
 def run_jobs(waiting: Sequence[Job], count: int, run: Callable[[Job], Row] | None = None) -> Iterator[tuple[Job, Row]]:

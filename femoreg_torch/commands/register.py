@@ -136,20 +136,28 @@ def register_into(
         raise InputError(
             f"{case.folder}: --robot was given, but there is no tool to steer, or no view has an image of it."
         )
+    find = None if weights is None else network_detector(case, weights, device or CPU)
+    marks = None if landmarks is None else read_pixels(landmarks)
+    poses = None if start is None else read_start_poses(start)
+    # before all is read: of a file that changes meanwhile it is not the digest that the next command finds
+    inputs = inputs_of(case, preset, weights, landmarks=landmarks, start=start, robot=robot)
     result, scene = register_scene(
         case,
         None,
         preset,
         seed=seed,
-        find=None if weights is None else network_detector(case, weights, device or CPU),
-        landmarks=None if landmarks is None else read_pixels(landmarks),
-        start=None if start is None else read_start_poses(start),
+        find=find,
+        landmarks=marks,
+        start=poses,
         device=device or CPU,
         report=report or silent,
         follow=follow,
     )
     result = replace(
-        result, errors=evaluate(case, result, scene), case=os.path.relpath(case.folder.resolve(), out.resolve())
+        result,
+        errors=evaluate(case, result, scene),
+        inputs=inputs,
+        case=os.path.relpath(case.folder.resolve(), out.resolve()),
     )
     navigation = None if result.object_from_tool is None else navigation_content(result, calibration)
     with new_folder(out, without=(*EVALUATION_NAMES, *NAVIGATION_NAMES, *REPLAY_NAMES, REVIEW_NAME)) as built:
@@ -157,6 +165,18 @@ def register_into(
         if navigation is not None:
             write_navigation(built, navigation)
     return result, navigation
+
+
+def inputs_of(case: "Case", preset: str, weights: Path | None = None, **given: Path | None) -> str:
+    """Digest of all that a run is made of: the files of its case, its preset, weights, and other files by option.
+
+    Raises `InputError`.
+    """
+    from femoreg_torch.case.inputs import inputs_digest
+    from femoreg_torch.configs import load_preset
+    from femoreg_torch.detect import weights_file
+
+    return inputs_digest(case, {"weights": weights_file(weights), **given}, load_preset("registration", preset))
 
 
 def _is_seen(case: "Case", tool: str) -> bool:

@@ -5,7 +5,7 @@ from femoreg_torch.detect.field import as_stored, filled, within_field
 from femoreg_torch.detect.grid import image_from_network, network_camera, to_network_grid
 from femoreg_torch.detect.network import Detection, detect
 from femoreg_torch.detect.normalise import normalise
-from femoreg_torch.detect.weights import LandmarkNetwork, load_network
+from femoreg_torch.detect.weights import LandmarkNetwork, load_network, weights_file
 
 __all__ = [
     "Detection",
@@ -19,5 +19,6 @@ __all__ = [
     "network_camera",
     "normalise",
     "to_network_grid",
+    "weights_file",
     "within_field",
 ]

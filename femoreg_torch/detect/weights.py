@@ -70,6 +70,14 @@ def load_network(path: Path | None = None, device: torch.device = CPU) -> Landma
     return LandmarkNetwork(module.eval().to(device), anatomy, weights.sigma_px)
 
 
+def weights_file(path: Path | None = None) -> Path:
+    """A weights file, without a path the shipped one."""
+    import models
+    from models.weights import SHIPPED_WEIGHTS
+
+    return path or Path(models.__file__).parent / "weights" / SHIPPED_WEIGHTS
+
+
 def check_counts(classes: int, landmarks: int, anatomy: Anatomy, where: str) -> None:
     """Raise `InputError` that starts with `where` unless a network has the classes and landmarks of an anatomy."""
     expected = (1 + len(anatomy.bones), len(anatomy.landmarks))

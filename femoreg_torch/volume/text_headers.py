@@ -53,7 +53,7 @@ class _Values:
 
     path: Path
     start: int  # byte
-    claimed: int  # bytes, uncompressed
+    claimed: int | None  # bytes, uncompressed; None where ITK tells itself what is wrong with them
     compressed: bool
 
 
@@ -62,14 +62,28 @@ def check_text_header(path: Path) -> None:
 
     Its values are all there, and those that are compressed are not damaged. Files of other names are passed.
     """
-    name = path.name.lower()
-    if not name.endswith((*META_SUFFIXES, *NRRD_SUFFIXES)):
-        return
-    with opened(path) as file:
-        beginning = file.read(_LONGEST_HEADER)
-    values = _of_meta_image(beginning, path) if name.endswith(META_SUFFIXES) else _of_nrrd(beginning, path)
+    values = _values(path)
     if values is not None:
         _check_values(values, path)
+
+
+def file_of_values(path: Path) -> Path:
+    """The file in which the values of a volume stand: another one than `path` where its header names one.
+
+    Raises `InputError` as `check_text_header` for a header that says something else.
+    """
+    values = _values(path)
+    return path if values is None else values.path
+
+
+def _values(path: Path) -> _Values | None:
+    """None for files of other names."""
+    name = path.name.lower()
+    if not name.endswith((*META_SUFFIXES, *NRRD_SUFFIXES)):
+        return None
+    with opened(path) as file:
+        beginning = file.read(_LONGEST_HEADER)
+    return _of_meta_image(beginning, path) if name.endswith(META_SUFFIXES) else _of_nrrd(beginning, path)
 
 
 def _of_meta_image(beginning: bytes, path: Path) -> _Values:
@@ -102,8 +116,8 @@ def _of_meta_image(beginning: bytes, path: Path) -> _Values:
     return _Values(there, there.stat().st_size - claimed if skipped < 0 else skipped, claimed, compressed)
 
 
-def _of_nrrd(beginning: bytes, path: Path) -> _Values | None:
-    """None where values are text, or start elsewhere in the file: ITK tells of these what is wrong."""
+def _of_nrrd(beginning: bytes, path: Path) -> _Values:
+    """Nothing is claimed where values are text, or start elsewhere in the file: ITK tells of these what is wrong."""
     if not beginning.startswith(b"NRRD"):
         raise InputError(f"{path}: no NRRD file, it does not begin with `NRRD`. Export it anew.")
     end = re.search(rb"\r?\n\r?\n", beginning)
@@ -121,7 +135,7 @@ def _of_nrrd(beginning: bytes, path: Path) -> _Values | None:
     encoding = fields.get("encoding", "").lower()
     skips = {fields.get(key, "0") for key in ("line skip", "lineskip", "byte skip", "byteskip")}
     if encoding not in ("raw", "gz", "gzip") or skips != {"0"}:
-        return None
+        return _Values(there, 0, None, False)
     start = end.end() if source is None and end is not None else 0
     return _Values(there, start, math.prod(shape) * each, encoding != "raw")
 
@@ -189,6 +203,8 @@ def _file_of_values(source: str, path: Path) -> Path:
 
 
 def _check_values(values: _Values, path: Path) -> None:
+    if values.claimed is None:
+        return
     there = values.path.stat().st_size - values.start
     if not values.compressed:
         if there != values.claimed or values.start < 0:
@@ -198,7 +214,7 @@ def _check_values(values: _Values, path: Path) -> None:
             )
         return
     try:
-        whole = _inflated(values) == values.claimed
+        whole = _inflated(values, values.claimed) == values.claimed
     except zlib.error:
         whole = False
     if not whole:
@@ -208,7 +224,7 @@ def _check_values(values: _Values, path: Path) -> None:
         )
 
 
-def _inflated(values: _Values) -> int:
+def _inflated(values: _Values, most: int) -> int:
     """How many bytes are compressed there by zlib or gzip, counted until there are too many; −1 if the end is missing.
 
     The checksum at the end is compared. Raises `zlib.error` for what is damaged.
@@ -216,7 +232,7 @@ def _inflated(values: _Values) -> int:
     stream, count = zlib.decompressobj(zlib.MAX_WBITS | 32), 0
     with opened(values.path) as file:
         file.seek(values.start)
-        while not stream.eof and count <= values.claimed:
+        while not stream.eof and count <= most:
             some = stream.unconsumed_tail or file.read(_CHUNK)
             if not some:
                 return -1

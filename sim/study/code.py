@@ -35,12 +35,6 @@ def digest(*values: Any) -> str:
     return hashlib.sha256(json.dumps(plain(values)).encode()).hexdigest()[:16]
 
 
-def digest_of_folder(folder: Path) -> str:
-    """Of the names and contents of all files in a folder, short."""
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    return digest([path.relative_to(folder) for path in paths], _of_files(paths))
-
-
 def _of_files(paths: list[Path]) -> str:
     found = hashlib.sha256()
     for path in paths:
