@@ -9,7 +9,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.beads.ct import find_beads
-from femoreg_torch.beads.model import Beads, check_beads
+from femoreg_torch.beads.model import Beads, check_beads, check_count
 from femoreg_torch.case import Case
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.errors import InputError, shortened
@@ -21,6 +21,7 @@ from femoreg_torch.volume import read_landmarks
 COLUMNS = ("image", "bead", "column_px", "row_px")
 IN_CT = "ct"
 _BY_HAND_MM = 0.2  # deviation of a bead's centre along an axis where a person has picked it
+_MOST = 1000  # beads in a bone
 _AROUND_MM = 4.0  # of the bone's labels, which is searched too: a label map may leave out a bead's voxels
 
 
@@ -55,52 +56,76 @@ def read_beads(path: Path, case: Case) -> Given:
     for name in entries.content:
         if name not in case.objects:
             raise InputError(f"{entries.where(str(name))}: the case has no such object, but {', '.join(case.objects)}.")
-    beads = tuple(_object(entries.mapping(name), name, case, path.parent) for name in entries.content)
-    names = [bead for thing in beads for bead in thing.names]
+    # all that a file can have wrong comes before a CT is searched, which takes a while
+    noise = _positive(top, "image_noise_px") if "image_noise_px" in top else None
+    first = "views" in top and top.choice("views", ("all", "first")) == "first"
+    told = [_told(entries.mapping(name), name, case, path.parent) for name in entries.content]
+    names = [bead for thing in told for bead in thing.names]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(
             f"{top.where('objects')}: two beads are named {shortened(repeated[0])}. Give every bead its own name."
         )
     marks = read_marks(top.file_path("annotations", path.parent), names, case) if "annotations" in top else None
-    noise = _positive(top, "image_noise_px") if "image_noise_px" in top else None
-    first = "views" in top and top.choice("views", ("all", "first")) == "first"
-    return Given(beads, marks, noise, first)
+    return Given(tuple(_beads(thing, case) for thing in told), marks, noise, first)
 
 
-def _object(fields: Fields, name: str, case: Case, folder: Path) -> Beads:
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """What the file says of the beads of one object."""
+
+    object: str
+    fields: Fields
+    diameter_mm: float
+    names: tuple[str, ...]
+    points: Tensor | None  # (N, 3) mm; None: to be found in the CT
+    noise_mm: float | None
+
+
+def _told(fields: Fields, name: str, case: Case, folder: Path) -> _Told:
     fields.only("points", "count", "diameter_mm", "noise_mm")
     diameter = _positive(fields, "diameter_mm")
-    searched = fields.text("points", "a file of points, or `ct`") == IN_CT
-    if searched:
-        points, deviations = _in_ct(fields, name, case, diameter)
-        named = {f"{name}{number}": point for number, point in enumerate(points, 1)}
-    else:
-        if "count" in fields:
-            raise InputError(f"{fields.where('count')}: goes with `points: ct` only; a file tells by itself how many.")
-        named = read_landmarks(fields.file_path("points", folder), None)
+    noise = _positive(fields, "noise_mm", or_zero=True) if "noise_mm" in fields else None
+    if fields.text("points", "a file of points, or `ct`") == IN_CT:
+        names = tuple(f"{name}{number}" for number in range(1, _count_in_ct(fields, name, case) + 1))
+        return _Told(name, fields, diameter, names, None, noise)
+    if "count" in fields:
+        raise InputError(f"{fields.where('count')}: goes with `points: ct` only; a file tells by itself how many.")
+    named = read_landmarks(fields.file_path("points", folder), None)
     points = torch.stack(list(named.values()))
     check_beads(points, fields.where("points"))
-    if not searched:
-        deviations = torch.full((len(points),), _BY_HAND_MM, dtype=torch.float64)
-    if "noise_mm" in fields:
-        deviations = torch.full((len(points),), _positive(fields, "noise_mm", or_zero=True), dtype=torch.float64)
-    return Beads(name, tuple(named), points, diameter, deviations)
+    return _Told(name, fields, diameter, tuple(named), points, noise)
 
 
-def _in_ct(fields: Fields, name: str, case: Case, diameter_mm: float) -> tuple[Tensor, Tensor]:
-    thing = case.objects[name]
-    if thing.model is not None:
+def _beads(told: _Told, case: Case) -> Beads:
+    """The beads that the file tells, those of a bone looked for in the CT."""
+    if told.points is None:
+        points, deviations = _in_ct(told, case)
+        check_beads(points, told.fields.where("points"))
+    else:
+        points, deviations = told.points, torch.full((len(told.points),), _BY_HAND_MM, dtype=torch.float64)
+    if told.noise_mm is not None:
+        deviations = torch.full((len(points),), told.noise_mm, dtype=torch.float64)
+    return Beads(told.object, told.names, points, told.diameter_mm, deviations)
+
+
+def _count_in_ct(fields: Fields, name: str, case: Case) -> int:
+    if case.objects[name].model is not None:
         raise InputError(
             f"{fields.where('points')}: {name} is no bone of the CT. Give a file with points in its space."
         )
-    count = fields.value("count", "the number of beads")
-    if not isinstance(count, int) or isinstance(count, bool) or count < 1:
-        raise InputError(f"{fields.where('count')}: a whole number of beads was expected, found {shortened(count)}.")
+    count = fields.whole("count", 1, _MOST)
+    check_count(count, fields.where("count"))
+    return count
+
+
+def _in_ct(told: _Told, case: Case) -> tuple[Tensor, Tensor]:
+    """Points (N, 3) and deviations (N,) of as many beads as the file says."""
     ct, bones = read_bones(case)
-    mask = torch.isin(bones.labels.data, torch.tensor(bones.of(thing.bones, case.anatomy), dtype=torch.uint8))
+    labels = bones.of(case.objects[told.object].bones, case.anatomy)
+    mask = torch.isin(bones.labels.data, torch.tensor(labels, dtype=torch.uint8))
     voxels = [round(_AROUND_MM / s) for s in ct.spacing_mm[::-1]]
-    grown = ndimage.maximum_filter(mask.numpy(), [2 * n + 1 for n in voxels])
-    return find_beads(ct, diameter_mm, count, torch.from_numpy(grown), f"{case.ct_path}, beads of {name}")
+    grown = torch.from_numpy(ndimage.maximum_filter(mask.numpy(), [2 * n + 1 for n in voxels]))
+    return find_beads(ct, told.diameter_mm, len(told.names), grown, f"{case.ct_path}, beads of {told.object}")
 
 
 def _positive(fields: Fields, key: str, or_zero: bool = False) -> float:

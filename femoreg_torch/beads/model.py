@@ -27,12 +27,15 @@ class Beads:
         return len(self.names)
 
 
+def check_count(count: int, where: str) -> None:
+    """Raises `InputError` that starts with `where` for too few beads."""
+    if count < MINIMUM:
+        raise InputError(f"{where}: {count} beads, at least {MINIMUM} are needed; from three follow up to four poses.")
+
+
 def check_beads(points: Tensor, where: str) -> None:
     """Raises `InputError` that starts with `where` unless a pose can follow from beads (N, 3) in mm."""
-    if len(points) < MINIMUM:
-        raise InputError(
-            f"{where}: {len(points)} beads, at least {MINIMUM} are needed; from three follow up to four poses."
-        )
+    check_count(len(points), where)
     if not torch.isfinite(points).all():
         raise InputError(f"{where}: holds coordinates that are not finite.")
     middle = points - points.mean(0)

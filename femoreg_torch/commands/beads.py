@@ -27,8 +27,10 @@ def beads(case: Path, *, beads: Path, out: Path, run: Path | None = None) -> Non
     from femoreg_torch.beads import measure, read_beads, uncertainty_content, write_measured
     from femoreg_torch.case import read_case, read_result
     from femoreg_torch.evaluation.fit import check_fits
+    from femoreg_torch.files import check_new_folder
 
     console = Console()
+    check_new_folder(out, case)
     procedure = read_case(case)
     rough = None
     if run is not None:

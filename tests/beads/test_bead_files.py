@@ -10,6 +10,7 @@ import torch
 import yaml
 from bead_scenes import DEVICE, FEMUR
 
+from femoreg_torch.beads import given as module
 from femoreg_torch.beads import read_beads
 from femoreg_torch.case import Case, CaseObject, View
 from femoreg_torch.errors import InputError
@@ -37,6 +38,10 @@ def written(case: Case, text: str) -> Path:
 BOTH = """objects:
   femur: {points: femur.mrk.json, diameter_mm: 1}
   device: {points: device.json, diameter_mm: 1.5, noise_mm: 0}
+"""
+IN_CT = """objects:
+  femur: {points: ct, count: 5, diameter_mm: 1}
+  device: {points: device.json, diameter_mm: 1}
 """
 TWICE = "objects:\n  femur: &f {points: femur.mrk.json, diameter_mm: 1}\n  device: *f\n"
 
@@ -75,12 +80,21 @@ def test_annotations_by_image_with_and_without_names(case: Case) -> None:
         ("objects: {femur: {points: femur.mrk.json, diameter_mm: 1, colour: red}}\n", "unknown key"),
         (BOTH + "views: second\n", "all or first was expected"),
         (BOTH + "annotations: none.csv\n", "there is no file"),
+        (IN_CT.replace("5", "2"), "femur.count: 2 beads, at least 4 are needed"),
+        (IN_CT.replace("5", "100000000"), "femur.count: a whole number from 1 to 1000"),
+        (IN_CT + "views: second\n", "all or first was expected"),
+        (IN_CT + "image_noise_px: -1\n", "a positive number was expected"),
+        (IN_CT + "annotations: none.csv\n", "there is no file"),
+        (IN_CT.replace("device.json", "none.json"), "there is no file"),
         (TWICE, "two beads are named 'f0'"),
         ("- a\n", "a mapping of keys and values"),
         ("objects: {femur: [\n", "cannot be read as YAML"),
     ],
 )
-def test_bad_files_are_told_in_one_line(case: Case, text: str, told: str) -> None:
+def test_bad_files_are_told_in_one_line_before_a_ct_is_searched(
+    case: Case, text: str, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "read_bones", lambda case: pytest.fail("the CT was read"))
     with pytest.raises(InputError, match=told) as caught:
         read_beads(written(case, text), case)
     assert "\n" not in str(caught.value)

@@ -195,6 +195,14 @@ def test_bad_input_ends_with_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_the_case_itself_is_not_written_and_is_told_before_it_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "case").mkdir()
+    assert main(["beads", str(tmp_path / "case"), "--beads", "none.yaml", "--out", str(tmp_path / "case")]) == 2
+    assert "is the folder that is read. Choose another one" in capsys.readouterr().err
+
+
 def test_a_folder_without_trials_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["beads-table", str(tmp_path)]) == 2
     assert "femoreg beads CASE" in capsys.readouterr().err
