@@ -161,12 +161,13 @@ def plan_robustness(
     count = stored.planning.robustness.draws if draws is None else draws
     if count < 1:
         raise InputError(f"--draws: 1 or more was expected, found {count}.")
+    runs = None
     if (study is None) == (covariance is None):
         raise InputError("plan-robustness: either --study or --covariance was expected.")
     if study is not None:
         if mean is not None:
             raise InputError("--mean: belongs to --covariance; a study has its own.")
-        moves = study_moves(study, stored.side, count, seed)  # first: the femur takes a while
+        moves, runs = study_moves(study, stored.side, count, seed)  # first: the femur takes a while
     else:
         assert covariance is not None  # one of the two
         variance = read_covariance(covariance)
@@ -192,7 +193,7 @@ def plan_robustness(
         "gain_percent_p95": high,
         "draws_without_marrow": lost,
         "seed": seed,
-    }
+    } | ({} if runs is None else {"study_runs": runs})
     write_json(plan / "robustness.json", again.content({"draws": outcomes}) | spread)
     save(robustness_figure(outcomes, again.baseline_n, again.planned_n), plan / "robustness.png")
     least = min(outcome.clearance_mm for outcome in outcomes)
@@ -200,6 +201,11 @@ def plan_robustness(
         f"Modelled gain {again.gain(again.planned_n):+.1f} % as planned; under these errors {middle:+.1f} % "
         f"(5 to 95 %: {low:+.1f} to {high:+.1f} %). Least clearance {least:.1f} mm."
     )
+    if runs is not None:
+        console.print(
+            f"The errors are those of {runs} trusted run{'' if runs == 1 else 's'} of the study"
+            + (", drawn again and again." if runs > 1 else ": of one run they have no spread, whatever is told above.")
+        )
     if lost:
         console.print(
             f"[bold red]In {lost} of {len(moves)} draws an injection finds no marrow[/]: they have no gain, and are "

@@ -16,7 +16,8 @@ from femoreg_torch.planning.prepare import Prepared
 
 _LEAST_SPAN_POINTS = 4.0  # of an axis of gains: smaller differences lie within the error of the mesh
 _PLANES = ("sagittal", "coronal", "axial")  # by the index axis square to them
-_AXES = ("R ← mm → L", "A ← mm → P", "mm → head")  # along the index axes
+_AXES = ("R ←   → L", "A ←   → P", "→ head")  # along the index axes
+_BAR_MM = 20.0  # length of the bar that tells the scale: places of a part cut out of the CT would mean nothing
 _BESIDE_MM = 8.0  # shown around the bone that is modelled
 
 
@@ -43,6 +44,7 @@ def overlay_figure(prepared: Prepared, plan: FemoroplastyPlan) -> Figure:
     """Three planes through the middle of the cement: CT, cement (filled), optimum (outline) and path (projected).
 
     They show the part of the femur that is modelled. In the axial plane the front is at the top, as in other viewers.
+    Cement is red where it takes a little of a voxel's pores, yellow where it takes all.
     """
     femur = prepared.bone.femur
     weight = plan.cement * prepared.bone.pores
@@ -69,9 +71,14 @@ def overlay_figure(prepared: Prepared, plan: FemoroplastyPlan) -> Figure:
         axis.plot(*line[0], "o", color="lime")
         upwards = edges[:, across[1]] if plane != "axial" else edges[::-1, across[1]]
         axis.set(title=plane, xlim=edges[:, across[0]], ylim=upwards, facecolor="black")
-        axis.set(xlabel=_AXES[across[0]], ylabel=_AXES[across[1]] if plane != "axial" else "P ← mm → A")
+        axis.set(xlabel=_AXES[across[0]], ylabel=_AXES[across[1]] if plane != "axial" else "P ←   → A")
+        axis.set(xticks=[], yticks=[])
+        corner = edges[0, across[0]] + 4, upwards[0] + (4 if plane != "axial" else -4)
+        axis.plot([corner[0], corner[0] + _BAR_MM], [corner[1], corner[1]], color="white", linewidth=3)
+        axis.annotate(f"{_BAR_MM:g} mm", corner, (0, 4), textcoords="offset points", color="white")
     figure.suptitle(
-        "cement as planned (filled), free optimum (blue), path (green, projected; dot: entry point) — "
+        "cement as planned (filled; red: little of a voxel's pores, yellow: all), free optimum (blue), "
+        "path (green, projected; dot: entry point)\n"
         f"{plan.volume_ml:g} ml, yield load {100 * plan.gain:+.0f} % (optimum {100 * plan.optimum_gain:+.0f} %), "
         "modelled"
     )

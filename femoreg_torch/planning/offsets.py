@@ -155,8 +155,10 @@ def _covariance_of(result: Result, file: File) -> Array:
     return np.asarray(result.path_covariance.numpy(), float)
 
 
-def study_moves(folder: File, side: Side, draws: int, seed: int) -> Array:
+def study_moves(folder: File, side: Side, draws: int, seed: int) -> tuple[Array, int]:
     """Moves (draws, 6), mm and degrees, of a femur of that side, drawn from the runs of a study with replacement.
+
+    Also tells how many runs they are drawn from.
 
     `folder` holds `runs.parquet` or `runs.csv` with signed errors (estimate minus truth). The robot brings the device
     where both are believed to fit, so that it ends beside the planned place in the bone by the bone's error minus the
@@ -192,7 +194,7 @@ def study_moves(folder: File, side: Side, draws: int, seed: int) -> Array:
     if "side" in table:
         other = np.array([value == _OTHER_SIDE[side] for value in table["side"]], bool)[kept]
         found[other] *= _MIRRORED
-    return np.asarray(found[np.random.default_rng(seed).integers(len(found), size=draws)])
+    return np.asarray(found[np.random.default_rng(seed).integers(len(found), size=draws)]), len(found)
 
 
 def _read_runs(folder: File) -> dict[str, Sequence[Any]]:

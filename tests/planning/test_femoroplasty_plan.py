@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path as File
 from typing import Any
@@ -307,6 +309,8 @@ def test_commands_end_to_end(
         (out / "robustness.json").read_text(encoding="utf-8")
     )  # both err alike: the path is where it was planned
     assert found["gain_percent_median"] == pytest.approx(found["planned_gain_percent"])
+    assert found["study_runs"] == 2
+    assert "The errors are those of 2 trusted runs of the study" in " ".join(capsys.readouterr().out.split())
     (folder / "sure.csv").write_text("0,0,0\n0,0,0\n0,0,0\n", encoding="utf-8")
     shift = ["--covariance", str(folder / "sure.csv"), "--mean", f"[{-response.distance_mm}, 0, 0]", "--draws", "1"]
     assert main(["plan-robustness", str(out), *shift]) == 0
@@ -344,6 +348,59 @@ def test_commands_end_to_end(
         line = capsys.readouterr().err
         assert told in line
         assert line.count("\n") == 1
+
+
+def other_case(place: File, folder: File, side: str) -> File:
+    """A case like the planned one, of a side."""
+    place.mkdir()
+    text = (folder / "case.yaml").read_text(encoding="utf-8")
+    (place / "case.yaml").write_text(text.replace("side: left", f"side: {side}"), encoding="utf-8")
+    write_landmarks(place / "landmarks.json", {"FH-l": plan_head(), "FH-r": plan_head()})
+    for name in ("ct.nii.gz", "labels.nii.gz"):
+        (place / name).symlink_to(folder / name)
+    return place
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        ("weak", r"holds a yield load of \d+ N without cement, the case .*other now gives \d+ N"),
+        ("cement", r"holds a yield load of \d+ N as planned, the case .* now gives \d+ N"),
+        ("moved", r"does not fit the case .*other: injection at .* from any marrow"),
+        ("side", r"is a plan for the left femur, the case .*other is of the right side"),
+    ],
+)
+def test_another_case_than_the_planned_one_is_refused(
+    kind: str, told: str, written: File, folder: File, tmp_path: File, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan = tmp_path / "plan"
+    shutil.copytree(written, plan, ignore=shutil.ignore_patterns("case"))
+    other = other_case(tmp_path / "other", folder, "right" if kind == "side" else "left")
+    ct, labels = read_ct(folder / "ct.nii.gz"), read_label_map(folder / "labels.nii.gz")
+    if kind == "weak":  # the same grid, and bone that absorbs less
+        (other / "ct.nii.gz").unlink()
+        weak = torch.where(labels.data > 0, 0.6 * ct.data, ct.data)
+        write_volume(other / "ct.nii.gz", ct.with_data(weak))
+    if kind == "moved":  # the same femur in another place
+        away = torch.eye(4, dtype=torch.float64)
+        away[0, 3] = 300
+        for name, volume in (("ct", ct), ("labels", labels)):
+            (other / f"{name}.nii.gz").unlink()
+            write_volume(other / f"{name}.nii.gz", Volume(volume.data, away @ volume.lps_from_index))
+        write_landmarks(other / "landmarks.json", {"FH-l": plan_head() + away[:3, 3]})
+    if kind == "cement":
+        content = json.loads((plan / "plan.json").read_text(encoding="utf-8"))
+        content["planned"]["yield_load_n"] *= 1.02
+        write_json(plan / "plan.json", content)
+    (tmp_path / "sure.csv").write_text("0,0,0\n0,0,0\n0,0,0\n", encoding="utf-8")
+    before = sorted(path.name for path in plan.iterdir())
+    commands = [["plan-offsets"], ["plan-robustness", "--covariance", str(tmp_path / "sure.csv")]]
+    for name, *options in commands if kind != "moved" else commands[:1]:
+        assert main([name, str(plan), "--case", str(other), *options]) == 2
+        line = capsys.readouterr().err
+        assert re.search(told, line)
+        assert line.count("\n") == 1
+    assert sorted(path.name for path in plan.iterdir()) == before
 
 
 def test_a_turned_path_keeps_its_entry_and_is_run_anew(prepared: Prepared, plan: FemoroplastyPlan) -> None:

@@ -178,23 +178,24 @@ def test_moves_of_a_study_are_those_of_its_trusted_runs(tmp_path: File, suffix: 
     columns |= {f"device_mm_{axis}": [0.5, 9.0, 0.5] for axis in AXES}
     columns["trusted"] = [True, False, True]
     write_runs(tmp_path, columns, suffix)
-    np.testing.assert_allclose(study_moves(tmp_path, "left", 50, 0), np.tile([0.5, 1.5, 2.5, 0, 0, 0], (50, 1)))
+    assert study_moves(tmp_path, "left", 50, 0)[1] == 2
+    np.testing.assert_allclose(study_moves(tmp_path, "left", 50, 0)[0], np.tile([0.5, 1.5, 2.5, 0, 0, 0], (50, 1)))
     columns |= {f"femur_deg_{axis}": [n, 9.0, n] for axis, n in zip(AXES, (0.1, 0.2, 0.3), strict=True)}
     columns |= {f"device_deg_{axis}": [0.1, 9.0, 0.1] for axis in AXES}
     columns |= {f"entry_point_mm_{axis}": [2.0, 9.0, 2.0] for axis in AXES}
     columns |= {f"tip_mm_{axis}": [0.5, 9.0, 0.5] for axis in AXES}
     write_runs(tmp_path, columns, suffix)  # with places of entry point and tip, these count
     np.testing.assert_allclose(
-        study_moves(tmp_path, "left", 9, 0), np.tile([1.5, 1.5, 1.5, 0, 0.1, 0.2], (9, 1)), atol=1e-12
+        study_moves(tmp_path, "left", 9, 0)[0], np.tile([1.5, 1.5, 1.5, 0, 0.1, 0.2], (9, 1)), atol=1e-12
     )
     columns["side"] = ["right", "left", "right"]
     write_runs(tmp_path, columns, suffix)
     mirrored = np.tile([-1.5, 1.5, 1.5, 0, -0.1, -0.2], (9, 1))
-    np.testing.assert_allclose(study_moves(tmp_path, "left", 9, 0), mirrored, atol=1e-12)
+    np.testing.assert_allclose(study_moves(tmp_path, "left", 9, 0)[0], mirrored, atol=1e-12)
     columns["side"] = ["", "left", None]  # not told
     write_runs(tmp_path, columns, suffix)
     as_it_is = np.tile([1.5, 1.5, 1.5, 0, 0.1, 0.2], (9, 1))
-    np.testing.assert_allclose(study_moves(tmp_path, "left", 9, 0), as_it_is, atol=1e-12)
+    np.testing.assert_allclose(study_moves(tmp_path, "left", 9, 0)[0], as_it_is, atol=1e-12)
     with pytest.raises(InputError, match="neither"):
         study_moves(tmp_path / "elsewhere", "left", 1, 0)
 
