@@ -193,6 +193,7 @@ def study(
     from rich.console import Console
 
     from femoreg_torch.errors import InputError
+    from femoreg_torch.files import check_folder
     from sim.study.engine import Executor
     from sim.study.executors import OnCluster, OnThisMachine
     from sim.study.study import plan_study
@@ -200,6 +201,7 @@ def study(
 
     if jobs < 1:
         raise InputError(f"--jobs: at least 1 was expected, got {jobs}.")
+    check_folder(out)
     with Console().status("reading the protocol"):
         plan = plan_study(config, procedures, out.resolve(), data, keep_cases)
     executor: Executor = OnThisMachine(jobs) if scheduler is None else OnCluster(scheduler)
@@ -218,7 +220,13 @@ def demo(*, out: Path = Path("out/demo"), seed: int = 1, preset: str = "fast") -
 
     from femoreg_torch.commands.evaluate import evaluate
     from femoreg_torch.commands.register import register
+    from femoreg_torch.files import check_folder, check_new_folder
+    from femoreg_torch.registration import load_plan
 
+    check_folder(out)  # all of this before half a minute of work
+    for part in ("patient", "case", "run"):
+        check_new_folder(out / part)
+    load_plan(preset)
     console = Console()
     console.rule("1 Procedural patient (synthetic anatomy)")
     phantom(out / "patient", seed=seed)
@@ -228,4 +236,8 @@ def demo(*, out: Path = Path("out/demo"), seed: int = 1, preset: str = "fast") -
     register(out / "case", out=out / "run", preset=preset, seed=seed)
     console.rule("4 Errors against the simulation's truth")
     evaluate(out / "case", out / "run")
+    console.print(
+        "That the guide's tip is far from the entry point is meant: the device is imaged in front of the patient, "
+        "before it is moved there."
+    )
     console.print("Research software, not a medical device: everything above is simulated.")

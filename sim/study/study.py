@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from femoreg_torch.case import read_case
+from femoreg_torch.case.inputs import inputs_digest
 from femoreg_torch.errors import InputError
 from sim.study.cases import REAL_IMAGED_MM, REGISTERED_MM, Stores, subject_folder
-from sim.study.code import digest, digest_of_folder, library_and_simulator
+from sim.study.code import digest, library_and_simulator
 from sim.study.engine import DISK_FULL, Executor, Work, carry_out
 from sim.study.procedures import Procedure
 from sim.study.protocol import Protocol, load_protocol, varied
 from sim.study.record import Record
 from sim.study.rows import TABLE_NAME, write_table
 from sim.study.store import Run, Store, batches, missing
-from sim.study.trial import kind
+from sim.study.trial import check_views, kind
 from sim.study.work import Recorded, Setting, Simulated, settings_of
 
 _TABLE_S, _TABLE_SHARE = 60.0, 0.02  # the table is renewed so often, and takes at most this share of the time
@@ -96,9 +97,10 @@ def _of_cases(protocol: Protocol, name: str, settings: dict[str, Setting], count
     for number, folder in enumerate(folders, 1):
         case = read_case(folder)
         procedure = Procedure(number, folder.name, case.side, protocol.procedure(number, False).seed)
-        content = digest_of_folder(folder)
+        content = inputs_digest(case)
         cases[number] = folder
         for key, setting in settings.items():
+            check_views(setting.variation.views, len(case.views), f"study {name}, {key}, views: {folder}")
             if case.truth is None and (setting.detections or setting.variation.start):
                 raise InputError(f"{folder}: has no truth, from which `start` and `detections` could be drawn.")
             made_with = digest(protocol.seed, setting.digest, content)

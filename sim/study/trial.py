@@ -59,6 +59,12 @@ def _write_overlay(path: Path, picture: Picture) -> None:
         part.write_bytes(jpeg.tobytes())
 
 
+def check_views(views: int | None, there: int, where: str) -> None:
+    """Raises `InputError` that starts with `where` for more views than there are, and for none."""
+    if views is not None and not 1 <= views <= there:
+        raise InputError(f"{where}: 1 to {there} views were expected, so many there are; found {views}.")
+
+
 def first_views(case: Case, views: int | None) -> Case:
     """The case with only so many of its views; with all if None."""
     if views is None:

@@ -29,7 +29,7 @@ from sim.study.protocol import Protocol, Variation
 from sim.study.record import Record
 from sim.study.starts import displaced
 from sim.study.store import Run
-from sim.study.trial import first_views, register_case
+from sim.study.trial import check_views, first_views, register_case
 from sim.theatre.settings import Simulation
 
 
@@ -65,7 +65,9 @@ def settings_of(protocol: Protocol, name: str) -> dict[str, Setting]:
     found = {}
     for variation in protocol.vary:
         where = f"study {name}, {variation.name}"
-        read_record(Simulation, simulation_of(variation, base), where)
+        simulation = read_record(Simulation, simulation_of(variation, base), where)
+        if not protocol.cases:
+            check_views(variation.views, len(simulation.acquisition.orbit_deg), f"{where}, views")
         plan = plans[variation.preset or protocol.preset]
         detections = variation.detections or protocol.detections
         found[variation.name] = Setting(variation, plan, base, detections, protocol.closed_loop)

@@ -41,6 +41,26 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--out", "{file}"], "is a file, a folder was"),
+        (["--out", "{file}er", "--preset", "nope"], "no registration preset 'nope'"),
+    ],
+)
+def test_what_the_demo_cannot_do_is_told_before_it_begins(
+    options: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    assert main(["demo", *(text.format(file=file) for text in options)]) == 2
+    told = capsys.readouterr()
+    assert says in told.err
+    assert told.err.count("\n") == 1
+    assert told.out == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 def result_of(run: Path) -> dict[str, Any]:
     return json.loads((run / "result.json").read_text(encoding="utf-8"))
 

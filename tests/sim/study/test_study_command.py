@@ -62,6 +62,16 @@ def test_bad_input_is_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_file_in_the_place_of_the_folder_is_told_before_any_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out").touch()
+    assert main(["study", "paper", "-n", "1", "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr()
+    assert "out: is a file, a folder was expected. Choose another name" in told.err
+    assert told.out == ""
+
+
 @pytest.mark.long  # two procedures, some minutes each
 def test_two_real_procedures_and_their_registration_once_more_as_recorded_ones(tmp_path: Path) -> None:
     out = tmp_path / "simulated"

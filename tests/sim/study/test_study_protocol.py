@@ -147,6 +147,8 @@ def test_settings_are_told_apart_by_what_they_change_alone(tmp_path: Path) -> No
         ({"vary": [{"name": "a", "xray": {"kvp": 80}}], "cases": ["x"]}, "recorded cases cannot be simulated .*xray"),
         ({"vary": [{"name": "a"}], "cases": ["nowhere/*"]}, "no folder with a case.yaml fits nowhere"),
         ({"vary": [{"name": "a", "varied": {"x": [1, 2]}}]}, "varied, x: a number or text"),
+        ({"vary": [{"name": "a", "views": 9}]}, "a, views: 1 to 3 views were expected, so many there are; found 9"),
+        ({"vary": [{"name": "a", "views": 0}]}, "a, views: 1 to 3 views .* found 0"),
     ],
 )
 def test_what_is_wrong_is_told(content: dict[str, Any], says: str, tmp_path: Path) -> None:

@@ -126,6 +126,10 @@ def test_a_recorded_case_is_registered_as_it_is(
     (kept / "view1.tif").write_bytes((kept / "view2.tif").read_bytes())
     (changed,) = plan_study(str(tmp_path / "own.yaml"), None, tmp_path / "out", None, False).runs
     assert changed.settings != run.settings
+    more = content | {"vary": [{"name": "again", "views": 9}]}
+    (tmp_path / "more.yaml").write_text(yaml.safe_dump(more), encoding="utf-8")
+    with pytest.raises(InputError, match=r"again, views: .* 1 to 3 views were expected, so many there are; found 9"):
+        plan_study(str(tmp_path / "more.yaml"), None, tmp_path / "out", None, False)
     # and without a truth nothing can be drawn from it
     (kept / "truth.json").unlink()
     case = yaml.safe_load((kept / "case.yaml").read_text(encoding="utf-8"))
