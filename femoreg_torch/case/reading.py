@@ -41,13 +41,7 @@ def read_case(folder: Path) -> Case:
     """
     folder = Path(folder)
     top = read_fields(folder)
-    version = top.value("version", " or ".join(map(str, VERSIONS)))
-    if version not in VERSIONS or isinstance(version, bool):
-        known = " and ".join(map(str, VERSIONS))
-        raise InputError(
-            f"{top.where('version')}: this FemoReg Torch reads versions {known}, found {shortened(version)}."
-        )
-    if version == 1:
+    if read_version(top) == 1:
         return femoroplasty_form.read_version_1(top, folder)
     if "template" in top:
         top.choice("template", (TEMPLATE,))
@@ -55,6 +49,17 @@ def read_case(folder: Path) -> Case:
     case = _read_objects(top.only(*_KEYS), folder)
     _check_kinds(case, top)
     return case
+
+
+def read_version(top: Fields) -> int:
+    """The version of the format that `case.yaml` has. Raises `InputError` for one that is not known."""
+    version = top.value("version", " or ".join(map(str, VERSIONS)))
+    if type(version) is not int or version not in VERSIONS:
+        known = " and ".join(map(str, VERSIONS))
+        raise InputError(
+            f"{top.where('version')}: this FemoReg Torch reads versions {known}, found {shortened(version)}."
+        )
+    return version
 
 
 def _read_objects(top: Fields, folder: Path) -> Case:

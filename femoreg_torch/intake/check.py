@@ -23,8 +23,8 @@ from femoreg_torch.case.femoroplasty import (
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.model import PlannedPath, Side
 from femoreg_torch.case.models import MODEL_KEYS, read_model
-from femoreg_torch.case.parts import read_carm, read_display
-from femoreg_torch.case.reading import read_fields
+from femoreg_torch.case.parts import read_carm, read_display, read_truth
+from femoreg_torch.case.reading import read_fields, read_version
 from femoreg_torch.errors import in_mm
 from femoreg_torch.fluoro import Display
 from femoreg_torch.intake.check_anatomy import (
@@ -73,7 +73,8 @@ def check_case(folder: Path, find_start: bool = True, landmarks: Mapping[str, Te
     top = found.attempt(lambda: read_fields(folder))
     if top is None:
         return Checked(tuple(found.problems), (), ())
-    short = top.content.get("template") == TEMPLATE and top.content.get("version") == 2
+    version = found.attempt(lambda: read_version(top))
+    short = top.content.get("template") == TEMPLATE and version != 1
     seen, images = _check_femoroplasty(top, folder, found) if short else (SeenAnatomy(), {})
     case = None
     if not found.problems:
@@ -126,7 +127,9 @@ def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAn
         _check_device(top, folder, path, side, found)
     images = check_views(top, folder, carm, display, found)
     if "truth" in top:
-        found.attempt(lambda: top.file_path("truth", folder))
+        names = [PELVIS, FEMUR, *([DEVICE] if DEVICE in top else [])]
+        count = len(found.attempt(lambda: top.mappings("views")) or ())
+        found.attempt(lambda: read_truth(top, folder, names, count))
     return seen, images
 
 

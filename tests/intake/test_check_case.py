@@ -1,5 +1,6 @@
-"""Two dozen broken cases with three to five faults each: every fault is told, each once, and nothing else."""
+"""Some 25 broken cases with three to five faults each: every fault is told, each once, and nothing else."""
 
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -111,6 +112,13 @@ def open_mesh(c: Content, folder: Path) -> None:
     trimesh.Trimesh(mesh.vertices, mesh.faces[3:]).export(folder / "device.stl")
 
 
+def truth_of_two_views(c: Content, folder: Path) -> None:
+    pose = np.eye(4).tolist()
+    poses = {"camera_from_pelvis": [pose, pose], "camera1_from_femur": pose, "camera1_from_device": pose}
+    (folder / "truth.json").write_text(json.dumps(poses), encoding="utf-8")
+    c.update(truth="truth.json")
+
+
 FAULTS: dict[str, Fault] = {
     "side": (lambda c, f: c.update(side="links"), r"case\.yaml, side: left or right was expected, found 'links'"),
     "extra key": (lambda c, f: c.update(sides="left"), r"case\.yaml, sides: unknown key"),
@@ -187,6 +195,8 @@ FAULTS: dict[str, Fault] = {
         lambda c, f: c["views"][0].update(field={"circle": {"centre": [1, 2], "radius": -3}}),
         r"radius: a positive",
     ),
+    "version": (lambda c, f: c.update(version=7), r"version: this FemoReg Torch reads versions 1 and 2, found 7"),
+    "truth": (truth_of_two_views, r"truth\.json, camera_from_pelvis: 2 poses, but the case has 3 views"),
     "no views": (lambda c, f: c.update(views=[]), r"views: empty"),
 }
 
@@ -215,6 +225,7 @@ BROKEN = [
     ("head in hip", "no field", "no model"),
     ("no intercept", "negative", "guide"),
     ("no grid", "turned", "no model"),
+    ("version", "truth", "side", "carm"),
 ]
 
 
@@ -242,8 +253,8 @@ def test_every_fault_of_a_broken_case_is_told_at_once(files: Path, tmp_path: Pat
     assert found.picture.max() > 200
 
 
-def test_there_are_two_dozen_with_several_faults_each_and_all_faults_occur() -> None:
-    assert len(BROKEN) == 24
+def test_there_are_25_with_several_faults_each_and_all_faults_occur() -> None:
+    assert len(BROKEN) == 25
     assert min(map(len, BROKEN)) >= 3
     assert {name for names in BROKEN for name in names} == set(FAULTS)
 
