@@ -61,6 +61,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def yaml_mapping(text: str | bytes, where: str) -> dict[str, Any]:
     """The mapping that a YAML text holds. Raises `InputError` as `yaml_content` does, and if it holds another thing."""
     content = yaml_content(text, where)
+    if content is None:
+        raise InputError(f"{where}: is empty, a mapping of keys and values was expected.")
     if not isinstance(content, dict):
         raise InputError(f"{where}: a mapping of keys and values was expected, found {type(content).__name__}.")
     return content
@@ -228,6 +230,8 @@ def json_content(text: str | bytes, where: str, with_nan: bool = False) -> Any:
     """
     if len(text) > MOST_JSON_BYTES:
         raise InputError(f"{where}: is larger than {MOST_JSON_BYTES / 2**20:g} MB, which no file of this kind is.")
+    if not text.strip():
+        raise InputError(f"{where}: is empty, JSON was expected.")
     try:
         content = json.loads(
             text.decode("utf-8-sig") if isinstance(text, bytes) else text,

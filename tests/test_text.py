@@ -9,7 +9,7 @@ from femoreg_torch.configs import load_preset
 
 from femoreg_torch.errors import InputError, in_mm, shortened
 from femoreg_torch.files import read_csv, read_json
-from femoreg_torch.text import json_content, read_yaml, yaml_content
+from femoreg_torch.text import json_content, read_yaml, yaml_content, yaml_mapping
 
 # 529 bytes that stand for 9¹¹ values
 BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
@@ -86,7 +86,8 @@ def test_what_is_not_plain_is_refused_at_once(text: str | bytes, message: str) -
         ('{"a": 1, "a": 2}', "key 'a' stands there twice"),
         (b"\xff", "cannot be read as JSON"),
         ('{"a": 1,}', "cannot be read as JSON"),
-        ("", "cannot be read as JSON"),
+        ("", "is empty, JSON was expected"),
+        (" \n", "is empty, JSON was expected"),
     ],
 )
 def test_json_alike(text: str | bytes, message: str, tmp_path: Path) -> None:
@@ -142,3 +143,9 @@ def test_a_missing_file_is_named_once(tmp_path: Path) -> None:
 )
 def test_lengths_are_told_as_people_write_them(length: float, told: str) -> None:
     assert in_mm(length) == told
+
+
+@pytest.mark.parametrize("text", ["", "# nothing but a remark\n", "~\n"])
+def test_an_empty_file_is_called_so(text: str) -> None:
+    with pytest.raises(InputError, match=r"a\.yaml: is empty, a mapping of keys and values was expected"):
+        yaml_mapping(text, "a.yaml")

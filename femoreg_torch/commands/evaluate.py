@@ -15,10 +15,13 @@ def evaluate(case: Path, run: Path) -> None:
     from rich.console import Console
     from rich.markup import escape
 
-    from femoreg_torch.case import read_case, read_result
+    from femoreg_torch.case import RESULT_NAME, read_case, read_result
     from femoreg_torch.commands.telling import tell_verdict
+    from femoreg_torch.errors import InputError
     from femoreg_torch.evaluation import error_tables, write_report
 
+    if (case / RESULT_NAME).is_file() and not (case / "case.yaml").is_file() and (run / "case.yaml").is_file():
+        raise InputError(f"{case}: is a run, and {run} is a case. Is the order `femoreg evaluate CASE RUN`?")
     console, result = Console(), read_result(run)
     errors = write_report(read_case(case), result, run)
     if errors is None:

@@ -18,6 +18,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -98,7 +99,8 @@ def _carry_out(arguments: list[str], commands: dict[str, EntryPoint]) -> int:
     elif arguments[0] in commands:
         return _run(commands[arguments[0]], arguments[1:])
     else:
-        raise InputError(f"no command {shortened(arguments[0])}; there are: {', '.join(commands)}.")
+        meant = "".join(f" Did you mean {name}?" for name in get_close_matches(arguments[0], commands, 1, 0.7))
+        raise InputError(f"no command {shortened(arguments[0])}.{meant} There are: {', '.join(commands)}.")
     return DONE
 
 

@@ -15,9 +15,10 @@ from femoreg_torch.drr.device import told, why_no_gpu
 
 @contextmanager
 def progress_report(console: Console, first: str) -> Iterator[Callable[[str, float], None]]:
-    """A bar that is told what is done and the share of the work behind it, from 0 to 1."""
+    """A bar that is told what is done and the share of the work behind it, from 0 to 1; none but in a terminal."""
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
+    unseen = not console.is_interactive  # an empty line would be left of it
+    with Progress(*columns, console=console, transient=True, disable=unseen) as progress:
         task = progress.add_task(first, total=1.0)
 
         def report(step: str, share: float) -> None:

@@ -25,8 +25,9 @@ def chosen_device(name: DeviceName) -> torch.device:
 def why_no_gpu() -> str | None:
     """Why this machine cannot compute on a GPU, in one line; None if it can."""
     if not torch.cuda.is_available():
-        built = torch.version.cuda or torch.version.hip
-        return f"torch is built for {built}, but sees no GPU" if built else "this torch is built for the CPU alone"
+        found = (("CUDA", torch.version.cuda), ("ROCm", torch.version.hip))
+        built = [f"{name} {version}" for name, version in found if version]
+        return f"torch is built for {built[0]}, but sees no GPU" if built else "this torch is built for the CPU alone"
     return cuda.why_no_kernels(torch.device("cuda"))
 
 

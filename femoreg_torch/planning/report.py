@@ -116,6 +116,8 @@ def add_response(folder: File, response: Response) -> None:
 def read_plan(folder: File) -> StoredPlan:
     """A plan that `write_plan` wrote. Raises `InputError` for a file that is missing or holds something else."""
     folder = File(folder)
+    if not (folder / PLAN_NAME).is_file():
+        raise InputError(f"{folder}: holds no {PLAN_NAME}. Give the folder that `femoreg plan` wrote.")
     content = read_json(folder / PLAN_NAME)
     where = f"{folder / PLAN_NAME}"
     try:

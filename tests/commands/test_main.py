@@ -127,7 +127,7 @@ def test_help_of_a_command_teaches(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["paint"], "no command 'paint'; there are: measure, fail, read, train."),
+        (["paint"], "no command 'paint'. There are: measure, fail, read, train."),
         (["--paint"], "no command '--paint'"),
         (["measure"], "`femoreg measure IMAGES --out OUT` was expected; IMAGES is missing, --out is missing. See"),
         (["measure", "a.png"], "IMAGES --out OUT` was expected; IMAGES is given, --out is missing."),
@@ -340,3 +340,8 @@ def test_wrong_values_are_told_by_option_and_kind(
 ) -> None:
     assert main(["measure", "a.tif", "--out", "o", *arguments]) == 2
     assert says in capsys.readouterr().err
+
+
+def test_a_mistyped_command_is_told_with_the_one_that_was_meant(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["mesure"]) == 2
+    assert "no command 'mesure'. Did you mean measure? There are: " in capsys.readouterr().err

@@ -89,6 +89,12 @@ def test_a_folder_without_result_is_refused(procedure, tmp_path):
         evaluate(procedure[0], tmp_path)
 
 
+def test_case_and_run_in_the_wrong_order_are_told(procedure):
+    folder, run = procedure
+    with pytest.raises(InputError, match=r"is a run, and .* is a case\. Is the order `femoreg evaluate CASE RUN`\?"):
+        evaluate(run, folder)
+
+
 def test_the_verdict_stands_in_the_report_and_in_the_terminal(procedure, capsys):
     folder, run = procedure
     evaluate(folder, run)

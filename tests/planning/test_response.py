@@ -10,6 +10,7 @@ import torch
 from pyarrow import parquet, table
 
 from femoreg_torch.case import ObjectQuality, Result, result_content
+from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import write_json
 from femoreg_torch.geometry import Poses
@@ -206,3 +207,12 @@ def write_runs(folder: File, columns: dict[str, Any], suffix: str) -> None:
         return
     lines = [",".join(columns), *(",".join(str(values[n]) for values in columns.values()) for n in range(3))]
     (folder / "runs.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+@pytest.mark.parametrize("order", [["plan-offsets"], ["plan-robustness", "--study", "none"]])
+def test_a_case_in_the_place_of_a_plan_is_told(
+    order: list[str], tmp_path: File, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "case.yaml").touch()
+    assert main([order[0], str(tmp_path), *order[1:]]) == 2
+    assert "holds no plan.json. Give the folder that `femoreg plan` wrote." in capsys.readouterr().err

@@ -294,7 +294,7 @@ def test_auto_takes_the_cpu_where_there_is_no_gpu_and_says_why(
 ) -> None:
     assert chosen_device("auto") == CUDA
     console = Console(file=StringIO(), width=200)
-    for built, why in ((None, "built for the CPU alone"), ("13.0", "sees no GPU")):
+    for built, why in ((None, "built for the CPU alone"), ("13.0", "built for CUDA 13.0, but sees no GPU")):
         monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
         monkeypatch.setattr(torch.version, "cuda", built)
         assert tell_device(console, "auto").type == "cpu"

@@ -154,3 +154,10 @@ def test_a_folder_without_runs_is_refused_in_one_line(
     assert main([command, str(tmp_path)]) == 2
     assert "runs.parquet: no such file" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_without_a_study_leaves_no_empty_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", str(tmp_path / "nope")]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.count("\n") == 1
