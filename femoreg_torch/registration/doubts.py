@@ -115,8 +115,8 @@ def doubts_about_the_images(scene: Scene, poses: Poses, imaging: Imaging) -> tup
             )
         elif found.as_stored is not None:
             told.append(
-                f"{what} fits nowhere as the case tells it, and {found.as_stored} it does {beside}: check `display` of "
-                "the case"
+                f"{what} fits nowhere as the case tells it, and {found.as_stored} it does {beside}: check `display` "
+                "and `intensity` of the view"
             )
         elif found.kind != scene.first_kind:
             told.append(

@@ -2,7 +2,7 @@
 
 A view that is mirrored, of another hip, or taken from farther off than the C-arm is looked for, ends somewhere. What is
 asked of it then looks like a leg that turned or a broken bone. So before all else every image is compared with what is
-drawn for it. Where one does not fit, it is looked at as another view, and mirrored and turned.
+drawn for it. Where one does not fit, it is looked at as another view, and mirrored, turned and inverted.
 """
 
 from collections.abc import Callable
@@ -45,6 +45,7 @@ _CHANGES: dict[str, Callable[[Tensor], Tensor]] = {
     "turned by 180°": lambda image: image.rot90(2),
     "turned by 90°": lambda image: image.rot90(1),
     "turned by 270°": lambda image: image.rot90(3),
+    "with bright and dark exchanged": lambda image: image if image.dtype == torch.bool else image.max() - image,
 }
 
 

@@ -46,6 +46,15 @@ def test_an_image_that_was_stored_otherwise(scene: Scene, dims: tuple[int, ...],
     assert len(told_of) == 1  # the device image of a view that was not placed is not complained of as well
 
 
+def test_an_image_that_was_inverted(scene: Scene) -> None:
+    inverted = 5 - scene.image("anatomy", 1)
+    fields: tuple[torch.Tensor | None, ...] = (None, torch.ones_like(inverted).bool(), None)
+    strange = replace(with_image(scene, "anatomy", 1, inverted), fields={"anatomy": fields})
+    (found,) = (each for each in misfits(strange, TRUTH, PLAIN) if each.kind == "anatomy")
+    assert (found.view, found.as_stored) == (1, "with bright and dark exchanged")
+    assert "check `display` and `intensity`" in doubts_about_the_images(strange, TRUTH, PLAIN)[0]
+
+
 def test_device_images_that_were_exchanged(scene: Scene) -> None:
     exchanged = with_image(scene, "device", 1, scene.image("device", 2))
     exchanged = with_image(exchanged, "device", 2, scene.image("device", 1))
