@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import natural
 from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.optimize import LevenbergMarquardt
@@ -61,7 +62,7 @@ class Rival:
     """Another place where a device fits the images with it."""
 
     apart_mm: float  # across its long axis
-    share: float  # of the similarity that the device adds where it was found
+    share: float  # of the similarity that the device adds where it was found, but for the view that it gains most in
 
 
 def besides(scene: Scene, poses: Poses, name: str, kind: Kind) -> list[Besides]:
@@ -102,7 +103,8 @@ def _look(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Besid
 def rival(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -> Rival | None:
     """The best other place of a device, up to 24 mm along both axes across it, by images of a `kind`; all else stays.
 
-    None where none of the best few starts ends elsewhere.
+    Of several views the one that gains most there is left out: along its beam the device moves nearly unseen, and lies
+    over itself. None where none of the best few starts ends elsewhere, or nothing is exposed.
     """
     thing, pose = scene.objects[name], poses.camera1_from[name]
     filled = (thing.volume.data > _INSIDE * thing.volume.data.max()).nonzero().cpu()
@@ -114,25 +116,36 @@ def rival(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -
     centre, scale = reference_point_in_view(scene, poses, name, 0), torch.tensor(_SCALE, dtype=torch.float64)
     body = Body((name,), 0, centre, scale)
     images = scene.there([kind], range(scene.views))
-    costs = image_costs(scene, poses, (body,), tuple(poses.camera1_from), images, _LEVEL, _SIMILARITY, imaging=imaging)
-    here = float(costs(costs.still[None]).mean())
-    gain = float(costs.without_what_moves().mean()) - here
+    names = tuple(poses.camera1_from)
+    try:
+        costs = image_costs(scene, poses, (body,), names, images, _LEVEL, _SIMILARITY, imaging=imaging)
+    except InputError:  # what is saturated leaves nothing to compare
+        return None
+    without = costs.without_what_moves()
+    gains = without - costs(costs.still[None])[0]
     found: list[Rival] = []
     for place in _lowest(lambda deltas: costs(deltas).mean(1), axes[:, :2], scale):
         start = torch.zeros(6, dtype=torch.float64)
         start[3:] = axes[:, :2] @ place / scale[3:]
         begun = moved(poses, (body,), start)
         again = Body((name,), 0, reference_point_in_view(scene, begun, name, 0), scale)
-        there = image_costs(
-            scene, begun, (again,), tuple(poses.camera1_from), images, _LEVEL, _SIMILARITY, imaging=imaging
-        )
+        there = image_costs(scene, begun, (again,), names, images, _LEVEL, _SIMILARITY, imaging=imaging)
         result = _OPTIMISER.minimise(stage_objective(there, (again,), None), 6, seed=0)
         ended = moved(begun, (again,), result.delta).camera1_from[name]
         moved_by = transform_points(ended @ thing.volume.lps_from_index, filled).mean(0) - points.mean(0)
         across = float((moved_by @ axes[:, :2]).norm())
         if across > apart:
-            found.append(Rival(across, (gain + here - result.value) / gain))
+            found.append(Rival(across, _share(without - there(result.delta[None])[0], gains)))
     return max(found, key=lambda each: each.share, default=None)
+
+
+def _share(elsewhere: Tensor, here: Tensor) -> float:
+    """What a device gains elsewhere of what it gains here (images,), without the image that it gains most in."""
+    asked = torch.ones_like(elsewhere, dtype=torch.bool)
+    if len(elsewhere) > 1:
+        asked[elsewhere.argmax()] = False
+    least = float(here[asked].sum())
+    return float(elsewhere[asked].sum()) / least if least > 0 else 0.0
 
 
 def _lowest(cost: Callable[[Tensor], Tensor], across: Tensor, scale: Tensor) -> list[Tensor]:

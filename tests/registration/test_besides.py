@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Poses, centred_camera
 from femoreg_torch.registration import Scene
-from femoreg_torch.registration.besides import besides, rival
+from femoreg_torch.registration.besides import _share, besides, rival
 from femoreg_torch.registration.doubts import doubts_beside_devices
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.volume import Volume, axis_aligned
@@ -91,3 +91,12 @@ def test_a_bone_that_moved_is_not_taken_for_something_else() -> None:
     scene = make_scene(TRUTH)
     scene = replace(scene, images=scene.images | {"device": images})
     assert doubts_beside_devices(scene, TRUTH, PLAIN, in_doubt=True) == ()
+
+
+def test_what_explains_one_view_alone_is_no_rival() -> None:
+    """Moved along the beam of view 1 a device explains that view as well as where it is, and no other."""
+    totals = torch.tensor([0.05, 0.04, 0.08])
+    assert _share(torch.tensor([-0.01, 0.0, 0.08]), totals) < 0
+    assert _share(0.8 * totals, totals) == pytest.approx(0.8)
+    assert _share(totals[:1], totals[:1]) == pytest.approx(1)  # there is no other view to ask
+    assert _share(torch.tensor([0.05, 0.01, 0.0]), torch.tensor([0.05, 0.0, 0.0])) == 0  # others show no device
