@@ -23,6 +23,7 @@ from femoreg_torch.fluoro.reading import (
     settled_intensity,
     write_image,
 )
+from femoreg_torch.fluoro.saturation import saturated
 from femoreg_torch.fluoro.tags import Tags, check_header, contradictions, nearest_side
 
 __all__ = [
@@ -58,6 +59,7 @@ __all__ = [
     "read_header",
     "read_image",
     "read_stored",
+    "saturated",
     "settled_intensity",
     "without_penumbra",
     "write_image",

@@ -94,12 +94,13 @@ def doubts(
         lambda: doubts_about_the_models(told, scene),
     ]
     first = on_all_cores(lambda ask: ask(), others, scene.device)
+    clear = scene.where_unsaturated()
     found = (
         *chain(*first),
         *doubts_about_handedness(scene, poses, imaging),
-        *doubts_about_rigidity(scene, poses, imaging),
+        *doubts_about_rigidity(clear, poses, imaging),
     )
-    return (*found, *doubts_beside_devices(scene, poses, imaging, bool(found)))
+    return (*found, *doubts_beside_devices(clear, poses, imaging, bool(found)))
 
 
 def doubts_about_the_images(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:

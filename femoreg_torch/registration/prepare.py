@@ -27,6 +27,7 @@ from femoreg_torch.fluoro import (
     intensity_of,
     read_image,
     read_stored,
+    saturated,
     settled_intensity,
     without_penumbra,
 )
@@ -79,6 +80,8 @@ def prepare_scene(case: Case) -> Scene:
             tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
             outline = outline_of(bones, case.anatomy)
         images, fields, told = reading.result()
+        bright = _saturated(images, fields)
+        told = (*told, *_told_saturated(bright))
         if from_ct:
             told = (*told_of_ct, *told)
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
@@ -106,6 +109,7 @@ def prepare_scene(case: Case) -> Scene:
         {name: objects[name] for name in case.objects},
         images,
         fields=fields,
+        saturated=bright,
         tissue=tissue,
         outline=outline,
         camera_from_camera1=torch.stack(cameras) if known else None,
@@ -238,6 +242,28 @@ def read_images(case: Case) -> tuple[ByKind, ByKind, tuple[str, ...]]:
             told.append(_told(case, kind, without))
     _check_different(case, images)
     return images, fields, tuple(told)
+
+
+def _saturated(images: ByKind, fields: ByKind) -> ByKind:
+    """The saturated pixels of all images; None where one has none."""
+    return {
+        kind: tuple(
+            None if image is None else saturated(image, field)
+            for image, field in zip(images[kind], fields[kind], strict=True)
+        )
+        for kind in images
+    }
+
+
+def _told_saturated(found: ByKind) -> tuple[str, ...]:
+    """What it means that pixels are saturated, in words; nothing where none is."""
+    shares = [float(mask.double().mean()) for masks in found.values() for mask in masks if mask is not None]
+    if not shares:
+        return ()
+    return (
+        f"up to {100 * max(shares):.0f} % of an image is saturated: whether something is bent or broken, and what else "
+        "lies beside a device, was not asked there",
+    )
 
 
 def _check_different(case: Case, images: ByKind) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, log_so3, project_points, transform_points
 from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.optimize import LevenbergMarquardt
@@ -64,7 +65,7 @@ class _Ends:
 def bend(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging) -> Bend | None:
     """Of an object at its pose, cut at a share of its length as far as it is seen; all else stays where it is.
 
-    None where the images show too little of one end.
+    None where the images show too little of one end, or nothing of them is exposed.
     """
     images: list[tuple[Kind, int]] = []
     for view in range(scene.views):
@@ -82,7 +83,11 @@ def bend(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging) 
         bodies = tuple(_body(poses, *end) for end in zip(names, ends.points, strict=True))
         return bodies, image_costs(scene, poses, bodies, [*shown, *names], images, level, _SIMILARITY, imaging=imaging)
 
-    bodies, costs = asked(_LEVELS[-1])
+    try:
+        for level in _LEVELS:
+            bodies, costs = asked(level)
+    except InputError:  # what is saturated leaves nothing to compare
+        return None
     uncut = float(costs(torch.zeros(1, len(costs.still), dtype=torch.float64)).mean())
     for level in _LEVELS:
         bodies, costs = asked(level)

@@ -80,6 +80,8 @@ class Scene:
     images: dict[Kind, tuple[Tensor | None, ...]]
     # pixels (H, W), bool, that no shutter shades, one mask per view; None, or no entry, where all are exposed
     fields: dict[Kind, tuple[Tensor | None, ...]] = field(default_factory=dict)
+    # pixels (H, W), bool, as bright as the image can tell, one mask per view; None, or no entry, where none is
+    saturated: dict[Kind, tuple[Tensor | None, ...]] = field(default_factory=dict)
     segmentations: tuple[Segmentation, ...] = ()  # one per view; none unless a stage weighs its pixels by them
     tissue: Volume | None = None  # attenuation of the soft tissue, 1/mm, in the space of `anchor`
     outline: Outline | None = None  # what checks the start, in the space of `anchor`
@@ -106,6 +108,7 @@ class Scene:
             objects={name: thing.to(device) for name, thing in self.objects.items()},
             images=moved(self.images),
             fields=moved(self.fields),
+            saturated=moved(self.saturated),
             segmentations=tuple(replace(s, probabilities=s.probabilities.to(device)) for s in self.segmentations),
             tissue=None if self.tissue is None else self.tissue.to(device),
             outline=None if self.outline is None else replace(self.outline, mask=self.outline.mask.to(device)),
@@ -131,6 +134,25 @@ class Scene:
     def field(self, kind: Kind, view: int) -> Tensor | None:
         """The exposed pixels (H, W), bool, of the image of a kind in a view (from 0); None where all are."""
         return self.fields[kind][view] if kind in self.fields else None
+
+    def where_unsaturated(self) -> "Scene":
+        """The same with only those pixels exposed that are not saturated, the scene itself if none is.
+
+        Of images of other kinds than the first, also where that of the first kind is not: there a shadow is cut off.
+        """
+        if not any(mask is not None for masks in self.saturated.values() for mask in masks):
+            return self
+
+        def left(kind: Kind, view: int) -> Tensor | None:
+            exposed = self.field(kind, view)
+            for each in dict.fromkeys((self.first_kind, kind)):
+                mask = self.saturated[each][view] if each in self.saturated else None
+                if mask is not None:
+                    exposed = ~mask if exposed is None else exposed & ~mask
+            return exposed
+
+        fields = {kind: tuple(left(kind, view) for view in range(self.views)) for kind in self.images}
+        return replace(self, fields=fields, saturated={})
 
     def there(self, kinds: Iterable[Kind], views: Iterable[int]) -> list[tuple[Kind, int]]:
         """Those images, (kind, view) pairs, of some kinds and views (from 0) that the scene has."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 from scipy import ndimage
 from torch import Tensor
+from torch.nn import functional as F
 
 from femoreg_torch.case import Start
 from femoreg_torch.drr import project
@@ -47,6 +48,8 @@ VOLUMES = {
 STARTS = {"pelvis": Start(), "femur": Start(beside="pelvis")}
 CLASSES = {"pelvis": (1, 2), "femur": (3,)}  # of a segmentation with four classes
 REFERENCE_POINTS = {"pelvis": float64(0, 0, 0), "femur": float64(64, 0, -20), "device": float64(0, 0, 0)}
+KINDS = {"anatomy": ("pelvis", "femur"), "device": ("pelvis", "femur", "device")}
+KINK_DEG = (5.0, -4.0, 0.0)  # of a broken object, along the axes of camera 1
 
 
 def true_poses(views: tuple[int, ...] = (0, 1, 2)) -> Poses:
@@ -131,6 +134,37 @@ def off(pose: Tensor, point: Tensor, rotation_deg: tuple[float, ...], translatio
     """A pose (4, 4) turned about one of the object's own points (3,) and shifted, in camera axes."""
     twist = torch.cat([float64(*rotation_deg) * math.pi / 180, float64(*translation_mm)])
     return about_point(exp_se3(twist), (pose @ torch.cat([point, float64(1)]))[:3]) @ pose
+
+
+def halves(volume: Volume, axis: int) -> tuple[Volume, Volume]:
+    """A volume's lower and upper half along an axis of its array."""
+    low = torch.zeros_like(volume.data)
+    half = volume.data.shape[axis] // 2
+    low.narrow(axis, 0, half).copy_(volume.data.narrow(axis, 0, half))
+    return volume.with_data(low), volume.with_data(volume.data - low)
+
+
+def images_of_broken(
+    name: str, axis: int, poses: Poses, kinds: dict[str, tuple[str, ...]]
+) -> dict[Kind, tuple[Tensor | None, ...]]:
+    """Images, finer than they are registered and averaged, with the upper half of an object turned by the kink."""
+    turned = off(poses.camera1_from[name], REFERENCE_POINTS[name], KINK_DEG, (0, 0, 0))
+    fine = centred_camera(1020.0, (1.5, 1.5), (176, 176))
+
+    def image(view: int, names: tuple[str, ...]) -> Tensor:
+        parts: list[Volume] = []
+        places: list[Tensor] = []
+        for each in names:
+            camera = poses.camera_from_camera1[view]
+            if each == name:
+                parts += halves(VOLUMES[each], axis)
+                places += [camera @ poses.camera1_from[each], camera @ turned]
+            else:
+                parts.append(VOLUMES[each])
+                places.append(camera @ poses.camera1_from[each])
+        return F.avg_pool2d(project(parts, torch.stack(places)[None], fine, 0.5)[None], 2)[0, 0]
+
+    return {kind: tuple(image(view, names) for view in range(3)) for kind, names in kinds.items()}
 
 
 def error(estimate: Tensor, truth: Tensor, point: Tensor) -> tuple[float, float]:

@@ -4,60 +4,19 @@ from dataclasses import replace
 
 import pytest
 import torch
-from registration_scenes import REFERENCE_POINTS, VOLUMES, make_scene, off, true_poses
-from torch import Tensor
-from torch.nn import functional as F
+from registration_scenes import KINDS, KINK_DEG, REFERENCE_POINTS, images_of_broken, make_scene, off, true_poses
 
-from femoreg_torch.drr import project
-from femoreg_torch.geometry import Poses, centred_camera
 from femoreg_torch.registration import Scene, doubts
 from femoreg_torch.registration.doubts import doubts_about_rigidity
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.rigidity import CUTS, Bend, bend
-from femoreg_torch.registration.scene import Kind
-from femoreg_torch.volume import Volume
 
 TRUTH = true_poses()
-KINK_DEG = (5.0, -4.0, 0.0)  # along the axes of camera 1
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return make_scene(TRUTH)
-
-
-def halves(volume: Volume, axis: int) -> tuple[Volume, Volume]:
-    """A volume's lower and upper half along an axis of its array."""
-    low = torch.zeros_like(volume.data)
-    half = volume.data.shape[axis] // 2
-    low.narrow(axis, 0, half).copy_(volume.data.narrow(axis, 0, half))
-    return volume.with_data(low), volume.with_data(volume.data - low)
-
-
-def images_of_broken(
-    name: str, axis: int, poses: Poses, kinds: dict[str, tuple[str, ...]]
-) -> dict[Kind, tuple[Tensor | None, ...]]:
-    """Images, finer than they are registered and averaged, with the upper half of an object turned by the kink."""
-    turned = off(poses.camera1_from[name], REFERENCE_POINTS[name], KINK_DEG, (0, 0, 0))
-    fine = centred_camera(1020.0, (1.5, 1.5), (176, 176))
-
-    def image(view: int, names: tuple[str, ...]) -> Tensor:
-        parts: list[Volume] = []
-        places: list[Tensor] = []
-        for each in names:
-            camera = poses.camera_from_camera1[view]
-            if each == name:
-                parts += halves(VOLUMES[each], axis)
-                places += [camera @ poses.camera1_from[each], camera @ turned]
-            else:
-                parts.append(VOLUMES[each])
-                places.append(camera @ poses.camera1_from[each])
-        return F.avg_pool2d(project(parts, torch.stack(places)[None], fine, 0.5)[None], 2)[0, 0]
-
-    return {kind: tuple(image(view, names) for view in range(3)) for kind, names in kinds.items()}
-
-
-KINDS = {"anatomy": ("pelvis", "femur"), "device": ("pelvis", "femur", "device")}
 
 
 def test_what_is_rigid_is_not_doubted(scene: Scene) -> None:
