@@ -45,7 +45,8 @@ def picture_of_start(case: Case, landmarks: Mapping[str, Tensor] | None = None) 
         if landmarks is not None:
             record = start_by_landmarks(case, scene.anchor, landmarks)
         else:
-            record = start_by_detection(case, scene, look_at(scene, 0, network_detector(case)))
+            find = network_detector(case)
+            record = start_by_detection(case, scene, look_at(scene, 0, find), find)
         used = sum(mark.used for mark in record.landmarks.values())
         facts.append(f"start: {record.source}, {used} landmarks within {record.reprojection_rms_px:.1f} pixels")
     poses = scene.start(None if record is None else record.camera1_from_object)

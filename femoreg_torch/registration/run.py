@@ -234,7 +234,7 @@ def _start(
         began = start_by_landmarks(case, scene.anchor, landmarks)
     else:
         assert seen is not None  # looked at above
-        began = start_by_detection(case, scene, seen)
+        began = start_by_detection(case, scene, seen, look)
     if plan.needs_segmentations and seen is not None and look is not None:
         scene = with_segmentations(scene, seen, look)
     return began, scene

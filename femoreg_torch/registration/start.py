@@ -47,10 +47,11 @@ class Start:
     few: bool = False  # landmarks: too few for a pose, which is that of the outlines
 
 
-def start_by_detection(case: Case, scene: Scene, detection: Detection) -> StartRecord:
+def start_by_detection(case: Case, scene: Scene, detection: Detection, find: Detector | None = None) -> StartRecord:
     """The pose (4, 4) of the scene's anchor from what the network sees in view 1, and how it came.
 
-    Raises `InputError` as `find_start` does, with the image's name.
+    Raises `InputError` as `find_start` does, with the image's name, and how the image would have to be turned if `find`
+    then sees landmarks that agree.
     """
     image, field = scene.image(scene.first_kind, 0), scene.field(scene.first_kind, 0)
     anatomy = case.anatomy or HIP
@@ -60,11 +61,47 @@ def start_by_detection(case: Case, scene: Scene, detection: Detection) -> StartR
         )
     except InputError as error:
         seen = f"{case.views[0].images[scene.first_kind]}: {error}"
-        raise InputError(f"{seen} {_OF_A_SIDE}" if case.display_of(0).source in ("left", "right") else seen) from error
+        if case.display_of(0).source in ("left", "right"):
+            raise InputError(f"{seen} {_OF_A_SIDE}") from error
+        turned = () if find is None else _told_turned(case, scene, anatomy, find)
+        raise InputError(" ".join([seen, *turned])) from error
     stored = case.display_of(0).pixels_to_stored(detection.pixels, case.carm.camera)
     if (distortion := view_distortion(case, 0)) is not None:
         stored = torch.from_numpy(distortion.bent(stored.numpy()))
     return _record(scene.anchor, replace(detection, pixels=stored), start, anatomy.landmark_names)
+
+
+def _told_turned(case: Case, scene: Scene, anatomy: Anatomy, find: Detector) -> tuple[str, ...]:
+    """In words, by which quarter turn the first image shows landmarks that agree; nothing where neither gives that.
+
+    On its head the network reads it anyway.
+    """
+    kind, display = scene.first_kind, case.display_of(0)
+    image, field = scene.image(kind, 0), scene.field(kind, 0)
+    for deg in (90, 270):
+        turn = Display(turned_deg=deg)
+        camera = turn.camera(case.carm.camera)
+        upright, exposed = turn.to_camera(image), None if field is None else turn.to_camera(field)
+        there = replace(
+            scene,
+            carm=replace(scene.carm, camera=camera),
+            images={kind: (upright, *scene.images[kind][1:])},
+            fields={kind: (exposed, *(None,) * (scene.views - 1))},
+        )
+        found = look_at(there, 0, find)
+        if found.turned:  # the other quarter turn sets it upright
+            continue
+        try:
+            start = find_start(case.landmarks, found, upright, camera, scene.outline, anatomy, exposed, display.beam)
+        except InputError:
+            continue
+        if not start.few:
+            turned = (display.turned_deg + (-deg if display.flipped else deg)) % 360
+            return (
+                f"Turned by a quarter it shows {int(start.pnp.inliers.sum())} landmarks that agree: is the picture not "
+                f"head up? Then write `display: {{turned: {turned}}}`.",
+            )
+    return ()
 
 
 def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) -> StartRecord:

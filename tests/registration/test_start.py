@@ -69,6 +69,27 @@ def test_inverted_grey_values_are_refused_however_many_landmarks_there_are() -> 
         start_by_detection(hip_case(), scene(), detection(14, inverted=True))
 
 
+@pytest.mark.parametrize(
+    ("display", "turned"), [(Display(), 90), (Display(turned_deg=90), 180), (Display("posterior"), 270)]
+)
+def test_a_picture_that_shows_more_when_turned_is_asked_to_be(display: Display, turned: int) -> None:
+    """The landmarks are found in the picture turned by a quarter, which the network is asked for after it failed."""
+    landmarks = dict(zip(NAMES[:6], torch.tensor(SIX, dtype=torch.float64), strict=True))
+    found = detection(6, inverted=False)
+    pose = POSE if display.source == "anterior" else POSE @ torch.diag(torch.tensor([-1.0, -1, 1, 1]).double())
+    found.pixels[:6] = project_points(CAMERA, transform_points(pose, torch.stack(list(landmarks.values()))))
+    case, plain = replace(case_of(landmarks), display=display), scene()
+    image = plain.image("anatomy", 0)
+
+    def find(shown: torch.Tensor, _: object) -> Detection:
+        return found if torch.equal(shown, image.rot90(1)) else detection(1, inverted=False)
+
+    with pytest.raises(InputError, match=rf"view1.tif: 1 usable .* 6 landmarks that agree.*turned: {turned}\}}"):
+        start_by_detection(case, plain, find(image, CAMERA), find)
+    with pytest.raises(InputError, match=r"\(--landmarks\)\.$"):
+        start_by_detection(case, plain, find(image, CAMERA), lambda *_: detection(1, inverted=False))
+
+
 def test_a_rotation_left_open_is_refused_where_no_outline_can_mend_it() -> None:
     """Six landmarks of one hip, seen exactly but trusted to some mm only."""
     points = torch.tensor(SIX, dtype=torch.float64)
