@@ -70,7 +70,7 @@ _SURE_OF_BREAK = 4.0
 _LEAST_GAIN_OF_BEND = 0.0002
 _GAIN_OF_BREAK, _APART_OF_BREAK_MM = 0.0008, 0.8
 # Another place of a device, of the similarity that it adds where it was found, without its best view: of wires beside
-# another one 0.44 and 0.48 and more; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
+# another one 0.44 and 0.48; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
 _AS_GOOD_ELSEWHERE = 0.37
 
 
@@ -301,7 +301,7 @@ def doubts_about_the_guide(case: Case, poses: Poses) -> tuple[str, ...]:
     assert case.plan is not None  # it has the path
     return (
         f"the guide of the {case.plan.tool} points against the planned path: are its points `tip` and `base` "
-        "exchanged, or entry point and target of the plan?",
+        "exchanged, or entry point and target of the plan? Is `side` the one that is treated?",
     )
 
 

@@ -41,8 +41,12 @@ def swapped_sides(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: A
         )
     elif len(other) > len(own):
         told.append(
-            f"landmarks: left and right are swapped: {', '.join(other)} lie on bones of the other side. Exchange the "
-            "endings -l and -r"
+            f"landmarks: left and right are swapped: {', '.join(other)} lie on bones of the other side. "
+            + (
+                "That may come from the label map: mend it first, and only it"
+                if told
+                else "Exchange the endings -l and -r"
+            )
         )
     return told
 

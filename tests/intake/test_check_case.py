@@ -289,6 +289,9 @@ def test_swapped_bones_are_told(files: Path, tmp_path: Path) -> None:
     problems = check_case(folder, find_start=False).problems
     assert any("hip_left lies to the right of hip_right" in one for one in problems)
     assert any("femur_left lies to the right of femur_right" in one for one in problems)
+    # landmarks that were right are not to be exchanged as well
+    assert any("landmarks: left and right are swapped" in one and "mend it first" in one for one in problems)
+    assert not any("Exchange the endings" in one for one in problems)
 
 
 def test_the_registration_refuses_swapped_sides_and_tells_what_was_done_to_a_label_map(
