@@ -88,5 +88,5 @@ def test_a_guide_that_points_out_of_the_bone_is_doubted(tip: float, base: float,
     poses = Poses(pose[None], {"pelvis": pose, "drill": pose})
     doubts = doubts_about_the_guide(case, poses)
     assert len(doubts) == told
-    assert all("`tip` and `base` exchanged" in doubt for doubt in doubts)
+    assert all("`tip` and `base` exchanged" in doubt and "Is `side` the one" in doubt for doubt in doubts)
     assert doubts_about_the_guide(case, Poses(pose[None], {"pelvis": pose})) == ()
