@@ -41,15 +41,13 @@ from femoreg_torch.intake.found import Found
 from femoreg_torch.intake.planes import Picture, side_by_side, stacked
 from femoreg_torch.intake.start_picture import picture_of_start
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
-from femoreg_torch.registration.models import model_attenuation
+from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM, model_attenuation
 from femoreg_torch.volume import is_in_ras, read_ct_told, read_landmarks
 from femoreg_torch.volume.borders import cut_bones
 
 _ANY_PATH = PlannedPath(FEMUR, torch.zeros(3).double(), torch.ones(3).double())
 _ANY_POINTS = {name: n * torch.ones(3).double() for n, name in enumerate(DEVICE_POINTS)}
 _FAR_MM = 150.0  # from the middle of a device, beyond its own size, no point of it lies
-_BEYOND_MM = 25.0  # outside the box of its model: a drill may stand out of a sleeve; or units and axes are others
-_GUIDE_MM = (20.0, 600.0)  # from base to tip; a model in metres, inches or µm is likely beyond
 _FAR_FROM_BONE_MM = 400.0  # a device that starts farther from the entry point is likely told wrong
 
 
@@ -160,16 +158,15 @@ def _check_device(top: Fields, folder: Path, path: PlannedPath | None, side: Sid
                     f"{device.where('points')}.{name}: lies {away:.0f} mm from the middle "
                     "of the device. Points are mm in the space of its model; check units and RAS/LPS."
                 )
-            elif (beyond := volume.beyond_mm(point)) > _BEYOND_MM:
+            elif (beyond := volume.beyond_mm(point)) > BEYOND_MM:
                 box = " × ".join(f"{mm:.3g}" for mm in size.tolist())
                 found.warnings.append(
                     f"device: its point {name} lies {beyond:.0f} mm outside the box of its model, which has {box} mm. "
-                    "Nothing later would tell a wrong point: has the model another unit (inches) or origin than the "
-                    "points?"
+                    "Has the model another unit (inches) or origin than the points?"
                 )
     if {"tip", "base"} <= set(points):
         length = float((points["tip"] - points["base"]).norm())
-        if not _GUIDE_MM[0] <= length <= _GUIDE_MM[1]:
+        if not GUIDE_MM[0] <= length <= GUIDE_MM[1]:
             found.warnings.append(
                 f"device: its tip lies {in_mm(length)} from its base. Is the model in mm? (Inches are 25.4 of them.)"
             )

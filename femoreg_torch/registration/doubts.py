@@ -5,6 +5,7 @@ The C-arm's file, its poses, the plan, models that the images do not show as the
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import chain
 
 import torch
@@ -13,6 +14,7 @@ from scipy.spatial import cKDTree
 from femoreg_torch.case import Case
 from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.cores import on_all_cores
+from femoreg_torch.errors import in_mm
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Poses, pose_difference, transform_points
 from femoreg_torch.registration.besides import besides, rival
@@ -21,11 +23,14 @@ from femoreg_torch.registration.covariance import PoseCovariance
 from femoreg_torch.registration.handedness import handedness
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.misfits import misfits
+from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM
 from femoreg_torch.registration.motion import MotionBetween
 from femoreg_torch.registration.orbit import orbits
 from femoreg_torch.registration.quality import Limits, shift_px
 from femoreg_torch.registration.rigidity import CUTS, bend
 from femoreg_torch.registration.scene import Scene
+from femoreg_torch.registration.sizes import size
+from femoreg_torch.registration.tips import TipLength, tip_length
 
 # A mobile C-arm that turns about its orbit comes back within some mm and degrees (the paper draws 2 mm and 1°), and
 # sags by a few mm more. A mirrored image ended 121 mm and 10° off.
@@ -72,6 +77,14 @@ _GAIN_OF_BREAK, _APART_OF_BREAK_MM = 0.0008, 0.8
 # Another place of a device, of the similarity that it adds where it was found, without its best view: of wires beside
 # another one 0.44 and 0.48; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
 _AS_GOOD_ELSEWHERE = 0.37
+# Of a device beside its model, mm, and what a model of that length gains of the similarity near the tip. Seen of 24
+# right devices of a foreign simulator: at most 0.5 mm, with a gain of 0.002; of eight whose tip was 2 to 3 mm off, with
+# what was estimated 1.1 to 3.3 mm and 0.03 to 0.6, or, where the estimate had emptied the model's tip, as it was told
+# 1.0 to 1.5 mm too long.
+_MOST_OFF_TIP_MM, _LEAST_GAIN_OF_TIP = 0.8, 0.01
+# Seen of 24 right devices there: at most 0.7 % and a gain of nothing; of models 2 and 3 % off 1.7 to 2.8 % and 0.0006
+# to 0.002.
+_MOST_OFF_SIZE, _LEAST_GAIN_OF_SIZE = 0.01, 0.0003
 
 
 def doubts(
@@ -84,7 +97,12 @@ def doubts(
     """
     displays = [case.display_of(view) for view in range(len(case.views))]
     if strange := doubts_about_the_images(scene, poses, imaging):
-        return (*strange, *doubts_about_the_plan(case, scene), *doubts_about_the_guide(case, poses))
+        return (
+            *doubts_about_units(case, told),
+            *strange,
+            *doubts_about_the_plan(case, scene),
+            *doubts_about_the_guide(case, poses),
+        )
     others: list[Callable[[], tuple[str, ...]]] = [
         lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
@@ -96,6 +114,8 @@ def doubts(
     first = on_all_cores(lambda ask: ask(), others, scene.device)
     clear = scene.where_unsaturated()
     found = (
+        *doubts_about_units(case, told),
+        *doubts_about_size(case, told.where_unsaturated(), clear, poses, imaging),
         *chain(*first),
         *doubts_about_handedness(scene, poses, imaging),
         *doubts_about_rigidity(clear, poses, imaging),
@@ -147,10 +167,11 @@ def doubts_beside_devices(scene: Scene, poses: Poses, imaging: Imaging, in_doubt
         if len(came) >= min(2, len(scene.there([kind], range(scene.views)))):
             other = rival(scene, poses, name, kind, imaging)
         if other is not None and other.share > _AS_GOOD_ELSEWHERE:
+            fits = "" if other.share >= 1 else f"{100 * other.share:.0f} % "
             told.append(
                 f"the {kind} images show something else of the shape of the {name}, {other.apart_mm:.0f} mm beside it, "
-                f"which it fits {100 * other.share:.0f} % as well: no image tells which of the two it is; take the "
-                "other one out of view and register again"
+                f"which it fits {fits}as well: no image tells which of the two it is; take the other one out of view "
+                "and register again"
             )
         elif came and in_doubt:
             told.append(
@@ -305,6 +326,21 @@ def doubts_about_the_guide(case: Case, poses: Poses) -> tuple[str, ...]:
     )
 
 
+def doubts_about_units(case: Case, told: Scene) -> tuple[str, ...]:
+    """Models that are likely told in another unit than mm, or points of them that are, in words."""
+    found = []
+    for name, thing in case.objects.items():
+        if thing.model is None or name not in told.objects:
+            continue
+        points, volume = thing.points, told.objects[name].volume
+        far = [point for point, place in points.items() if volume.beyond_mm(place) > BEYOND_MM]
+        length = float((points["tip"] - points["base"]).norm()) if {"base", "tip"} <= set(points) else GUIDE_MM[0]
+        if far or not GUIDE_MM[0] <= length <= GUIDE_MM[1]:
+            what = f"its point {far[0]} lies far outside its model" if far else f"its guide is {in_mm(length)} long"
+            found.append(f"the {name}: {what}: are model and points in mm? (Inches are 25.4 of them.)")
+    return tuple(found)
+
+
 def doubts_about_the_models(told: Scene, scene: Scene) -> tuple[str, ...]:
     """Models of which a part was found to attenuate next to nothing, in words."""
     found = []
@@ -318,6 +354,54 @@ def doubts_about_the_models(told: Scene, scene: Scene) -> tuple[str, ...]:
                 "images, and not mirrored, and that its nominal pose is not far off (see the preset fast_wide_device)"
             )
     return tuple(found)
+
+
+def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
+    """Devices that the images show larger or smaller than their models, or with another tip, in words.
+
+    Where a model ends beyond the device, its end may have been estimated to be empty; so it is asked as told, too.
+    """
+    found = []
+    for name, kind in devices(scene, poses):
+        words = []
+        shown = size(scene, poses, name, kind, imaging)
+        if abs(shown.factor - 1) > _MOST_OFF_SIZE and shown.gain > _LEAST_GAIN_OF_SIZE:
+            words.append(
+                f"the {name} about {100 * abs(shown.factor - 1):.1f} % "
+                f"{'larger' if shown.factor > 1 else 'smaller'} than its model, beside the bones"
+            )
+        off = _tip_elsewhere(case, told, scene, poses, name, kind, imaging)
+        if off is not None:
+            words.append(
+                f"the guide of the {name} end {abs(off.longer_mm):.1f} mm "
+                f"{'beyond' if off.longer_mm > 0 else 'before'} the tip of its model"
+            )
+        if words:
+            found.append(
+                f"the images show {' and '.join(words)}: check that the model is the one in the images, its length, "
+                "its size and their unit, and the voxel size of the CT"
+            )
+    return tuple(found)
+
+
+def _tip_elsewhere(
+    case: Case, told: Scene, scene: Scene, poses: Poses, name: str, kind: str, imaging: Imaging
+) -> TipLength | None:
+    """Where a guide ends in the images, if that is not where its model does."""
+    points = case.objects[name].points
+    if not {"base", "tip"} <= set(points):
+        return None
+    guide = points["base"], points["tip"]
+    as_told = replace(scene, objects=scene.objects | {name: told.objects[name]})
+    found, if_told = (tip_length(of, poses, name, kind, guide, imaging) for of in (scene, as_told))
+    off = [] if found is None or not _ends_elsewhere(found) else [found]
+    if if_told is not None and if_told.longer_mm < 0 and _ends_elsewhere(if_told):
+        off.append(if_told)
+    return max(off, key=lambda each: each.gain, default=None)
+
+
+def _ends_elsewhere(found: TipLength) -> bool:
+    return abs(found.longer_mm) > _MOST_OFF_TIP_MM and found.gain > _LEAST_GAIN_OF_TIP
 
 
 def doubts_about_handedness(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:

@@ -1,0 +1,140 @@
+"""Does a guide end in the images where its model ends?
+
+A tip is a small part of a device. Were it some mm longer than its model, all else of the device would still lie where
+it is, and hardly any similarity over the whole images would be lost. But the tip is what is steered. So the last
+centimetres of the model are drawn out and pushed together along the guide, and the images near the tip are asked which
+length they show.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from femoreg_torch.cores import on_all_cores
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import Poses, project_points, transform_points
+from femoreg_torch.registration.imaging import Imaging
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import image_costs
+from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene
+from femoreg_torch.similarity import GradNcc
+from femoreg_torch.volume import Volume
+
+_LEVEL = Level(pixel_mm=1.55, step_mm=0.75)
+_SIMILARITY = GradNcc(patch_radius=3)
+_LONGEST_MM = 4  # by which the model is drawn out or pushed together, in steps of 1 mm
+_STRETCH_MM = 6.0, 14.0  # before the tip: where the model is drawn out; nearer to the tip it keeps its shape
+_AROUND_MM = 12.0  # of the guide's axis: what is drawn out, and, on the plane of the tip, what is looked at
+_LEAST_PIXELS = 200  # of an image, near the tip, for it to count
+
+
+@dataclass(frozen=True)
+class TipLength:
+    """How the end of a guide lies in the images."""
+
+    longer_mm: float  # than its model
+    gain: float  # of the mean patch Grad-NCC near the tip, by a model of that length
+
+
+def tip_length(
+    scene: Scene, poses: Poses, name: str, kind: Kind, guide: tuple[Tensor, Tensor], imaging: Imaging
+) -> TipLength | None:
+    """Of a device at its pose, whose guide runs from one point (3,) mm to the tip, in its own space.
+
+    None where the images of that kind do not show the place of the tip, or what is saturated hides it.
+    """
+    base, tip = (point.double() for point in guide)
+    axis = (tip - base) / (tip - base).norm()
+    near = _near_the_tip(scene, poses, name, kind, tip, axis)
+    images = [(kind, view) for view, mask in enumerate(near) if mask is not None and mask.sum() >= _LEAST_PIXELS]
+    if not images:
+        return None
+    thing = scene.objects[name]
+    rest, end = _parted(thing.volume, tip, axis)
+    names = f"{name}, without its tip", f"{name}, its tip"
+    objects = [
+        RigidObject(part, thing.reference_point, thing.shown_in, sharp=thing.sharp, hardening=thing.hardening)
+        for part in (rest, end)
+    ]
+    shown = [other for other in scene.shown(poses.camera1_from, kind) if other != name]
+    for each in names:
+        poses = poses.with_object(each, poses.camera1_from[name])
+    scene = replace(
+        scene,
+        objects=scene.objects | dict(zip(names, objects, strict=True)),
+        fields=scene.fields | {kind: tuple(near)},
+    )
+    still = Body((names[1],), 0, tip, torch.ones(6, dtype=torch.float64))
+    try:
+        costs = image_costs(scene, poses, (still,), [*shown, *names], images, _LEVEL, _SIMILARITY, imaging=imaging)
+    except InputError:  # what is exposed leaves nothing to compare
+        return None
+    lengths = range(-_LONGEST_MM, _LONGEST_MM + 1)
+    drawn = costs.objects[names[1]].volume
+
+    def cost(mm: float) -> float:
+        candidate = costs.with_object(names[1], replace(objects[1], volume=_stretched(drawn, tip, axis, mm)))
+        return float(candidate(candidate.still[None]).mean())
+
+    found = on_all_cores(cost, lengths, scene.device)
+    best = min(max(min(range(len(found)), key=lambda n: found[n]), 1), len(found) - 2)
+    before, here, after = found[best - 1 : best + 2]
+    bend = before - 2 * here + after
+    between = min(max((before - after) / (2 * bend), -1.0), 1.0) if bend > 0 else 0.0
+    return TipLength(lengths[best] + between, found[_LONGEST_MM] - min(found))
+
+
+def _near_the_tip(scene: Scene, poses: Poses, name: str, kind: Kind, tip: Tensor, axis: Tensor) -> list[Tensor | None]:
+    """The exposed pixels (H, W), bool, of the images of a kind around the end of a guide; None where there is none."""
+    near: list[Tensor | None] = []
+    for view in range(scene.views):
+        if not scene.there([kind], [view]):
+            near.append(None)
+            continue
+        image, camera, pose = scene.image(kind, view), scene.camera(poses, view), poses.camera_from(name)[view]
+        ends = transform_points(pose, torch.stack([tip - _STRETCH_MM[0] * axis, tip + _LONGEST_MM * axis]))
+        (u0, v0), (u1, v1) = project_points(camera, ends).tolist()
+        radius = _AROUND_MM * camera.sdd_mm / float(ends[1, 2]) / camera.mean_pixel_mm
+        rows, columns = (torch.arange(n, device=image.device) for n in image.shape)
+        run_u, run_v = u1 - u0, v1 - v0
+        x, y = columns[None] - u0, rows[:, None] - v0
+        along = ((x * run_u + y * run_v) / max(run_u**2 + run_v**2, 1e-9)).clamp(0, 1)
+        mask = (x - along * run_u) ** 2 + (y - along * run_v) ** 2 <= radius**2
+        exposed = scene.field(kind, view)
+        near.append(mask if exposed is None else mask & exposed)
+    return near
+
+
+def _parted(volume: Volume, tip: Tensor, axis: Tensor) -> tuple[Volume, Volume]:
+    """All but a box around the end of a guide; and that box, with room for the guide to grow, on a grid of its own."""
+    inverse, size = torch.linalg.inv(volume.lps_from_index), torch.tensor(volume.data.shape).flip(0)
+    ends = torch.stack([tip - _STRETCH_MM[1] * axis, tip + _LONGEST_MM * axis])
+    low, high = ends.amin(0) - _AROUND_MM, ends.amax(0) + _AROUND_MM
+    corners = transform_points(inverse, torch.cartesian_prod(*torch.stack([low, high]).T))
+    first, last = corners.amin(0).floor().long(), corners.amax(0).ceil().long()
+    inside_first, inside_last = first.clamp_min(0).minimum(size), (last + 1).clamp_min(0).minimum(size)
+    x, y, z = (slice(int(a), int(b)) for a, b in zip(inside_first, inside_last, strict=True))
+    rest = volume.data.clone()
+    rest[z, y, x] = 0
+    around = [int(n) for pair in zip(inside_first - first, last + 1 - inside_last, strict=True) for n in pair]
+    affine = volume.lps_from_index.clone()
+    affine[:3, 3] += affine[:3, :3] @ first.double()
+    return volume.with_data(rest), Volume(F.pad(volume.data[z, y, x], around), affine)
+
+
+def _stretched(volume: Volume, tip: Tensor, axis: Tensor, mm: float) -> Volume:
+    """A volume whose last centimetres along an axis are drawn out by so much; pushed together where it is negative."""
+    data = volume.data
+    size = torch.tensor(data.shape).flip(0)
+    x, y, z = (torch.arange(n, dtype=torch.float64) for n in size.tolist())
+    rates = volume.lps_from_index[:3, :3].T @ axis
+    height = z[:, None, None] * rates[2] + y[:, None] * rates[1] + x * rates[0]
+    height += (volume.lps_from_index[:3, 3] - tip) @ axis
+    near, far = _STRETCH_MM
+    moved = mm * ((height + far) / (far - near + mm)).clamp(0, 1)  # of what lands at that height
+    along = torch.linalg.solve(volume.lps_from_index[:3, :3], axis)  # voxels per mm
+    planes = torch.meshgrid(z, y, x, indexing="ij")[::-1]
+    source = torch.stack([2 * (n - moved * a) / (m - 1) - 1 for n, a, m in zip(planes, along, size, strict=True)], -1)
+    return volume.with_data(F.grid_sample(data[None, None], source[None].to(data), align_corners=True)[0, 0])
