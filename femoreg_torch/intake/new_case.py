@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import SimpleITK as sitk
 import torch
 import yaml
 from torch import Tensor
@@ -43,6 +42,7 @@ from femoreg_torch.volume import (
 from femoreg_torch.volume.bones import nearest_label
 from femoreg_torch.volume.dicom import is_dicom
 from femoreg_torch.volume.itk import DETACHED, read_itk
+from femoreg_torch.volume.reading import write_image
 
 NEEDED = ("ct", "labels", "landmarks", "plan", "images")
 _COPIED = (".nii", ".nii.gz", ".nrrd", ".mha")  # volumes of one file, which are taken as they are
@@ -218,7 +218,7 @@ def _copied(path: Path, folder: Path, stem: str) -> str:
     A header whose values stand in a file of their own is written together with them.
     """
     if path.name.lower().endswith(DETACHED):
-        sitk.WriteImage(read_itk(path), str(folder / f"{stem}.mha"))
+        write_image(folder / f"{stem}.mha", read_itk(path))
         return f"{stem}.mha"
     suffix = next((s for s in (".seg.nrrd", ".nii.gz") if path.name.lower().endswith(s)), path.suffix.lower())
     name = stem + (suffix or ".dcm")

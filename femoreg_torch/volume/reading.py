@@ -1,5 +1,6 @@
 """Reading and writing of volumes. Whatever the index order of a file, index axes inside run along +L, +P, +S."""
 
+import errno
 from collections.abc import Collection
 from pathlib import Path
 
@@ -181,7 +182,7 @@ def write_volume(path: Path, volume: Volume) -> None:
     """
     if volume.data.dtype.is_floating_point:
         volume = volume.with_data(volume.data.round().clamp(-32768, 32767).to(torch.int16))
-    _write(path, _image(volume))
+    write_image(path, _image(volume))
 
 
 def write_labels_like(path: Path, labels: Volume, ct: Path) -> None:
@@ -198,17 +199,29 @@ def write_labels_like(path: Path, labels: Volume, ct: Path) -> None:
         image = sitk.DICOMOrient(image, code)
         if image.GetSize() == stored.GetSize():
             image.CopyInformation(stored)
-    _write(path, image)
+    write_image(path, image)
 
 
-def _write(path: Path, image: sitk.Image) -> None:
+def write_image(path: Path, image: sitk.Image) -> None:
+    """Write an image, whole or not at all. Raises `OSError` that names the file if it cannot be written."""
     with temporary_file(Path(path)) as part:
         try:
             with quiet():
                 sitk.WriteImage(image, str(part), useCompression=True)
         except RuntimeError as error:
             reason = (str(error).strip().splitlines() or ["unknown reason"])[-1][:200]
-            raise OSError(f"{path}: cannot be written ({reason}).") from error
+            raise OSError(errno.EIO, f"cannot be written ({reason})", str(path)) from error
+        if not _holds(part, image):
+            raise OSError(errno.ENOSPC, "cannot be written whole. Is the disk full?", str(path))
+
+
+def _holds(path: Path, image: sitk.Image) -> bool:
+    """Whether a file has all voxels of an image. Where a full disk cuts a NIfTI off, ITK's writer says nothing."""
+    try:
+        written = read_itk(path)
+    except InputError:  # damaged
+        return False
+    return np.array_equal(sitk.GetArrayViewFromImage(written), sitk.GetArrayViewFromImage(image))
 
 
 def _image(volume: Volume) -> sitk.Image:

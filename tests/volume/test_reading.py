@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import torch
+from fuzz_faults import full_after
 from scipy.spatial.transform import Rotation
 
 from femoreg_torch.anatomy import label_table
@@ -412,6 +413,20 @@ def test_written_volumes_come_back(tmp_path: Path, suffix: str) -> None:
     assert torch.equal(again.data, data)
     torch.testing.assert_close(again.lps_from_index, affine, atol=1e-5, rtol=0)
     assert [p.name for p in tmp_path.iterdir()] == [f"ct{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", [".nii", ".nii.gz", ".nrrd", ".mha"])
+@pytest.mark.parametrize("missing", [1, 5, 3000])
+def test_a_volume_that_a_full_disk_cuts_off_is_told_and_not_kept(suffix: str, missing: int, tmp_path: Path) -> None:
+    noise = torch.randint(-1000, 1000, (20, 20, 20), generator=torch.Generator().manual_seed(1)).to(torch.int16)
+    volume, path = Volume(noise, torch.eye(4, dtype=torch.float64)), tmp_path / f"ct{suffix}"
+    write_volume(path, volume)
+    size = path.stat().st_size
+    path.unlink()
+    with full_after(size - missing), pytest.raises(OSError, match="cannot be written") as told:
+        write_volume(path, volume)
+    assert told.value.filename == str(path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_real_landmarks_lie_in_the_bones_of_their_side(data_folder: Path) -> None:
