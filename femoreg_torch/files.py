@@ -23,7 +23,7 @@ from femoreg_torch.text import MOST_JSON_BYTES, json_content, read_bytes
 _RANDOM_PART = "????????"  # of a name by tempfile.mkdtemp
 _SUFFIX = ".part"
 _LONGEST_NAME = 240  # bytes; Linux allows 255, and the hidden folder beside has a name that is longer by 15
-_NO_ROOM = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT}
+NO_ROOM = {errno.ENOSPC, errno.EFBIG, errno.EDQUOT}  # what the system says of a full disk
 _MOST_NEW = 50  # folders that are made for one that is asked for; Python makes them by recursion
 _LOCK, _NEW, _OLD = "lock", "new", "old"  # what a workshop holds: a lock, what is being written, what it replaces
 
@@ -249,7 +249,7 @@ def _workshop(path: Path) -> Iterator[Path]:
         (workshop / _NEW).mkdir()
         yield workshop
     except OSError as error:
-        if error.filename is None and error.errno in _NO_ROOM:  # the system does not say for which file
+        if error.filename is None and error.errno in NO_ROOM:  # the system does not say for which file
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
     finally:

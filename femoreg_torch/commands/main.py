@@ -80,8 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return BAD_INPUT
     except OSError as error:
-        place = "a file could not be read or written" if error.filename is None else error.filename
-        return _complain(f"{place}: {error.strerror or error}.")
+        return _complain(f"{_place(error)}: {error.strerror or error}.")
     except MemoryError:
         return _complain("the memory does not suffice. Close other programs, or crop the volumes.")
     except KeyboardInterrupt:
@@ -89,6 +88,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except Exception as error:
         return _tell_defect(error)
+
+
+def _place(error: OSError) -> str:
+    """The file that an error of the system is about: of two, as of a copy, the one written if there is no room."""
+    from femoreg_torch.files import NO_ROOM
+
+    written = error.filename2 if error.errno in NO_ROOM else None
+    place = error.filename if written is None else written
+    return "a file could not be read or written" if place is None else str(place)
 
 
 def _carry_out(arguments: list[str], commands: dict[str, EntryPoint]) -> int:

@@ -10,6 +10,7 @@ import pytest
 import SimpleITK as sitk
 import torch
 import yaml
+from fuzz_faults import full_after
 from intake_files import ENTRY, HEAD, SPACING, bones, landmarks, markups, ras_affine, write_files
 from pydicom.dataset import FileMetaDataset
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, XRayAngiographicImageStorage, generate_uid
@@ -306,6 +307,19 @@ def test_inspect_says_what_is_there(files: Path, name: str, kind: str, fact: str
     assert found.kind == kind
     assert any(fact in one for one in found.facts), found.facts
     assert (found.picture is not None) == (kind in ("DICOM folder", "CT", "label map", "image", "DICOM image"))
+
+
+@pytest.mark.parametrize("ct", ["ct.nii.gz", "dicom"])  # copied, and written anew
+def test_a_full_disk_is_told_with_the_file_that_finds_no_room(
+    ct: str, files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with full_after(5000):  # holds the images, not the CT
+        assert main(arguments(files, tmp_path / "case", ct=files / ct)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"femoreg: {tmp_path}/case/ct.nii.gz: ")
+    assert str(files) not in error
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_inspect_lists_what_stands_together(files: Path, tmp_path: Path) -> None:
