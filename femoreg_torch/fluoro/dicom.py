@@ -155,7 +155,7 @@ def _numbers(dataset: Any, frames: Frames | None, path: Path) -> tuple[int, ...]
     if frames is None:
         if count > 1:
             raise InputError(
-                f"{path}: holds {count} frames, one was expected. Name one in the view, `frames: 1` (`--frame 1` of "
+                f"{path}: holds several frames, one was expected. Name one in the view, `frames: 1` (`--frame 1` of "
                 "`femoreg detect`), several to be averaged, `frames: [1, 2]`, or `frames: mean`."
             )
         return (0,)

@@ -37,7 +37,7 @@ from femoreg_torch.intake.check_anatomy import (
     planes_of,
 )
 from femoreg_torch.intake.check_images import check_images, check_views, readable_views
-from femoreg_torch.intake.found import Found
+from femoreg_torch.intake.found import Found, alike_together
 from femoreg_torch.intake.planes import Picture, side_by_side, stacked
 from femoreg_torch.intake.start_picture import picture_of_start
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
@@ -87,7 +87,7 @@ def check_case(folder: Path, find_start: bool = True, landmarks: Mapping[str, Te
             found.warnings += start.warnings
             below = start.picture
     picture = stacked(planes_of(seen, case), below)
-    return Checked(tuple(found.problems), tuple(found.warnings), tuple(found.facts), picture)
+    return Checked(tuple(alike_together(found.problems)), tuple(found.warnings), tuple(found.facts), picture)
 
 
 def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAnatomy, dict[str, Tensor]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TypeVar
 
 from femoreg_torch.case.fields import Fields
@@ -36,3 +37,18 @@ class Found:
         for key in fields.content:
             if key not in known:
                 self.attempt(lambda key=key: Fields({key: 0}, fields.file, fields.path).only(*known))  # type: ignore[misc]
+
+
+def alike_together(problems: Sequence[str]) -> list[str]:
+    """The problems, those that say the same of several files (`FILE: …`) as one that names the others at its end."""
+    files: dict[str, list[str]] = {}
+    for problem in problems:
+        file, _, said = problem.partition(": ")
+        files.setdefault(said or problem, []).append(file)
+    return [_of_all(said, of) if said != of[0] else said for said, of in files.items()]
+
+
+def _of_all(said: str, files: Sequence[str]) -> str:
+    first, *others = files
+    more = f" The same of {', '.join(Path(file).name for file in others)}." if others else ""
+    return f"{first}: {said}{more}"

@@ -104,12 +104,29 @@ def make_case(out: Path, given: NewCase) -> list[str]:
         write_text(folder / "case.yaml", text)
         checked = check_case(folder, find_start=False)
         if checked.problems:
-            told = [problem.replace(str(folder), str(out)) for problem in checked.problems]
+            sources = _sources(content, given)
+            told = [_as_given(problem, folder, sources).replace(str(folder), str(out)) for problem in checked.problems]
             flags = [flag for key, flag in _SAID_BY.items() if any(key in problem for problem in told)]
             hint = f" To new-case, this is said by {', '.join(flags)}." if flags else ""
             raise InputError(_together(f"{out}: not written", told) + hint)
         notes += checked.warnings
     return notes
+
+
+def _sources(content: dict[str, Any], given: NewCase) -> dict[str, Path]:
+    """The files given, by the names that the case has for those that are read first when it is checked."""
+    views = content["views"]
+    sources = {view["anatomy"]: path for view, path in zip(views, _files(given.images, []), strict=True)}
+    if given.device is not None:
+        sources[content[DEVICE]["model"]] = given.device
+        sources |= {view[DEVICE]: path for view, path in zip(views, _files(given.device_images, []), strict=False)}
+    return sources
+
+
+def _as_given(problem: str, folder: Path, sources: dict[str, Path]) -> str:
+    """The problem with the files given in place of their copies in `folder`, which are not kept."""
+    copies = rf"({re.escape(str(folder))}/)?\b({'|'.join(map(re.escape, sources))})(?!\w)"
+    return re.sub(copies, lambda found: str(sources[found[2]]) if found[1] else _short(sources[found[2]]), problem)
 
 
 def _check_given(given: NewCase) -> None:

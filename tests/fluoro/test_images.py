@@ -146,7 +146,7 @@ def damaged(kind: str, folder: Path) -> Path:
         ("nan mha", "not finite"),
         ("nan nii", "not finite"),
         ("volume", "one image was expected, found 5 × 12 × 10"),
-        ("frames", "2 frames"),
+        ("frames", "several frames"),
         ("no pixels", "no image that can be decoded"),
         ("short pixels", "no image that can be decoded"),
     ],

@@ -230,6 +230,28 @@ def test_what_is_wrong_is_told_at_once_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_is_wrong_with_six_images_alike_is_told_once_and_of_the_files_given(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for kind in ("plain", "device"):
+        (tmp_path / kind).mkdir()
+        for n in (1, 2, 3):
+            write_dicom_image(tmp_path / kind / f"IM{n}", n, frames=4 + n)
+    given = {"images": [tmp_path / "plain"], "device_images": [tmp_path / "device"]}
+    assert main(arguments(files, tmp_path / "case", **given)) == 2
+    told = capsys.readouterr().err
+    assert told.count("holds several frames") == 1
+    assert f"{tmp_path}/plain/IM1: holds several frames" in told
+    assert "The same of device/IM1, plain/IM2, device/IM2, plain/IM3, device/IM3." in told
+    assert "view1" not in told
+    assert "said by --frames" in told
+    write_dicom_image(tmp_path / "device/IM2", 2, frames=2)
+    assert main(arguments(files, tmp_path / "case", frames=3, **given)) == 2
+    told = capsys.readouterr().err
+    assert f"{tmp_path}/device/IM2: there is no frame 3" in told
+    assert "The same of" not in told
+
+
 def test_headers_say_side_and_values_and_flags_may_say_otherwise(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -250,7 +272,7 @@ def test_headers_say_side_and_values_and_flags_may_say_otherwise(
     assert any("the patient's posterior side" in fact for fact in found.facts)
     assert any("shown: the first frame" in fact for fact in found.facts)
     told = made("cine")
-    assert "holds 2 frames, one was expected" in told
+    assert "holds several frames, one was expected" in told
     assert "To new-case, this is said by --frames." in told
     assert "the patient's posterior side, by the header of run1" in made("behind", frames="mean")
     case = read_case(tmp_path / "behind")
