@@ -1,7 +1,7 @@
 """Bones, landmarks, sides, classes of the network, and label tables of a body part, as data (`configs/anatomy/`)."""
 
 from femoreg_torch.anatomy.body import HIP, Anatomy, Bone, Landmark, load_anatomy
-from femoreg_torch.anatomy.tables import LabelTable, bone_of_name, label_table, label_table_names
+from femoreg_torch.anatomy.tables import LabelTable, bone_of_name, fitting_tables, label_table, label_table_names
 
 __all__ = [
     "HIP",
@@ -10,6 +10,7 @@ __all__ = [
     "LabelTable",
     "Landmark",
     "bone_of_name",
+    "fitting_tables",
     "label_table",
     "label_table_names",
     "load_anatomy",

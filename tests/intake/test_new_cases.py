@@ -475,11 +475,11 @@ def test_parts_that_no_bone_is_called_by_are_named(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     image = sitk.ReadImage(str(files / "bones.seg.nrrd"))
-    image.SetMetaData("Segment1_Name", "Hueftbein rechts")
+    image.SetMetaData("Segment1_Name", "Knochen 2")
     sitk.WriteImage(image, str(tmp_path / "mine.seg.nrrd"))
     assert main(arguments(files, tmp_path / "case", labels=tmp_path / "mine.seg.nrrd")) == 0
     told = " ".join(capsys.readouterr().out.split())
-    assert "parts of mine.seg.nrrd that are taken for no bone: Hueftbein rechts" in told
+    assert "parts of mine.seg.nrrd that are taken for no bone: Knochen 2" in told
     assert "does not tell the hip_right, which landmarks lie on" in told
 
 
