@@ -86,7 +86,7 @@ def segment(
     )
 
 
-def landmarks(ct: Path, labels: Path, *, out: Path, bones: str = "femoreg", series: str | None = None) -> None:
+def landmarks(ct: Path, labels: Path, *, out: Path, bones: str | None = None, series: str | None = None) -> None:
     """Propose the 14 hip landmarks of a CT from its label map, by the rules that the landmark network was trained with.
 
     Writes OUT (.mrk.json: markups of 3D Slicer, to be corrected there; else plain JSON) and says the error to expect of
@@ -94,16 +94,18 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str = "femoreg", seri
 
     Args:
         ct: CT in HU: folder of a DICOM series, or a NIfTI, NRRD or MHA file.
-        labels: Label map of hip bones and femora.
+        labels: Segmentation of hip bones and femora, as `femoreg new-case` takes it.
         out: File to write (.mrk.json or .json).
-        bones: Label table of the map (femoreg, totalsegmentator_v2, …, or a YAML file).
+        bones: Label table of the map (totalsegmentator_v2, …, or a YAML file). By default the names of its parts say
+            it, or else it is of `femoreg segment`.
         series: Which of several DICOM series: its number, UID, or a part of its description.
     """
     from rich.console import Console
     from rich.markup import escape
 
-    from femoreg_torch.anatomy import HIP, label_table
+    from femoreg_torch.anatomy import HIP
     from femoreg_torch.errors import InputError
+    from femoreg_torch.intake.label_tables import table_of_map
     from femoreg_torch.segment import propose_landmarks
     from femoreg_torch.volume import bone_labels, read_ct_told, read_labels_told, swapped_sides, write_landmarks
 
@@ -111,7 +113,7 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str = "femoreg", seri
         raise InputError(f"{out}: the name is to end in .mrk.json or .json.")
     console = Console(soft_wrap=True)
     volume, told = read_ct_told(ct, series)
-    table = label_table(bones)
+    table, parts = table_of_map(labels, bones, usual="femoreg")
     found_labels, more = read_labels_told(labels, volume, {n for ids in table.values() for n in ids})
     known = bone_labels(found_labels, volume, table, HIP, {})
     with console.status("looking for landmarks"):
@@ -119,7 +121,7 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str = "femoreg", seri
     if not found.points:
         raise InputError(f"{labels}: no landmark could be found on its bones. Look at it with `femoreg inspect`.")
     write_landmarks(out, found.points)
-    for note in (*told, *more):
+    for note in (*told, *parts, *more):
         console.print(f"  {escape(note)}", highlight=False)
     for name, error in found.expected_error_mm.items():
         console.print(f"  {name}: expected error {error:.1f} mm", highlight=False)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from femoreg_torch.anatomy import HIP, bone_of_name
+from femoreg_torch.anatomy import HIP, bone_of_name, fitting_tables
 from femoreg_torch.case import read_case
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Frames, nearest_side, read_stored
@@ -18,7 +18,6 @@ from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import (
     ct_warnings,
     described,
-    fitting_tables,
     header_warnings,
     looks_like_labels,
 )

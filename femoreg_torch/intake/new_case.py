@@ -10,7 +10,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from femoreg_torch.anatomy import HIP, LabelTable, bone_of_name, label_table, label_table_names
+from femoreg_torch.anatomy import HIP, LabelTable, label_table, label_table_names
 from femoreg_torch.case.femoroplasty import DEVICE, DEVICE_POINTS, FEMUR, TEMPLATE, femoral_head, operated_femur
 from femoreg_torch.case.model import Intensity, Side
 from femoreg_torch.case.nominal import ALONG_PATH, NominalPlace
@@ -21,21 +21,17 @@ from femoreg_torch.files import new_folder, plain, write_text
 from femoreg_torch.fluoro import Display, Source, carm_settings, may_be_image, nearest_side, read_header
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.check import check_case
-from femoreg_torch.intake.check_anatomy import some_of
-from femoreg_torch.intake.volumes import fitting_tables
+from femoreg_torch.intake.label_tables import table_of_map
 from femoreg_torch.segment import load_bone_network, propose_landmarks, segment_bones
 from femoreg_torch.volume import (
     Volume,
     bone_labels,
-    has_names,
     is_in_ras,
     read_ct_told,
-    read_label_map,
     read_labels_told,
     read_landmarks,
     read_mesh,
     read_path_points,
-    segment_names,
     write_landmarks,
     write_volume,
 )
@@ -171,7 +167,8 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     if given.labels is None:
         bones, (labels_name, labels) = label_table(_OWN_TABLE), _segmented(folder, ct, notes)
     else:
-        bones = _bones(given, notes)
+        bones, more = table_of_map(given.labels, given.bones)
+        notes += more
         labels_name, labels = _labels(folder, given.labels, ct, bones, notes)
     landmarks = given_landmarks or _proposed(labels, ct, bones, notes)
     side = given.side or _side(labels, ct, bones, landmarks, entry_point, notes)
@@ -241,36 +238,6 @@ def _copied(path: Path, folder: Path, stem: str) -> str:
     name = stem + (suffix or ".dcm")
     shutil.copyfile(path, folder / name)
     return name
-
-
-def _bones(given: NewCase, notes: list[str]) -> LabelTable:
-    """Which ids of the label map are which bones."""
-    assert given.labels is not None
-    if given.bones is not None:
-        return label_table(given.bones)
-    if has_names(given.labels):
-        names = segment_names(given.labels)
-        table: LabelTable = {}
-        for text, ids in names.items():
-            if bone := bone_of_name(HIP, text):
-                table[bone] = (*table.get(bone, ()), *ids)
-        if not table:
-            raise InputError(
-                f"{given.labels}: none of its parts is named after a bone; there are: {', '.join(names)[:200]}. Name "
-                f"them {', '.join(HIP.bone_names)}."
-            )
-        if others := [text for text in names if bone_of_name(HIP, text) is None]:
-            notes.append(f"parts of {given.labels.name} that are taken for no bone: {some_of(others)}")
-        return table
-    there = [n for n in torch.unique(read_label_map(given.labels).data).tolist() if n]
-    fitting = fitting_tables(there)
-    hint = (
-        f"hip bones and femora of {' and of '.join(fitting)} are there" if fitting else "no shipped table fits its ids"
-    )
-    raise InputError(
-        f"--bones: is missing, and {given.labels.name} does not name its bones. Say which table its ids are of: "
-        f"{', '.join(label_table_names())}, or a YAML file ({hint})."
-    )
 
 
 def _told_bones(bones: LabelTable) -> str | dict[str, list[int]]:

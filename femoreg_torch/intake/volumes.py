@@ -1,7 +1,6 @@
 """What is worth knowing, and worth a warning, of a CT and of a label map."""
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +8,11 @@ import nibabel
 import numpy as np
 import torch
 
-from femoreg_torch.anatomy import label_table, label_table_names
 from femoreg_torch.arrays import opened
 from femoreg_torch.volume import Volume
 from femoreg_torch.volume.borders import touched_faces
 
 _COARSE_MM, _COARSE_STEP_MM = 1.5, 3.0  # the registration takes voxels of 1 mm
-_OF_THE_HIPS = ("hip_left", "hip_right", "femur_left", "femur_right")
 _SOFT_HU, _BONE_HU, _METAL_HU = -50.0, 300.0, 2800.0
 _LEAST_AIR = 0.005  # share of the voxels; beside every patient there is some
 _METAL_ML = 1.0
@@ -69,19 +66,6 @@ def looks_like_labels(volume: Volume) -> bool:
         return False
     sample = volume.data.flatten()[:: max(1, volume.data.numel() // 2_000_000)]
     return bool((sample == sample.round()).all()) and len(sample.unique()) <= 256
-
-
-def fitting_tables(ids: Sequence[int]) -> list[str]:
-    """Names of the shipped label tables of which a map holds both hip bones and both femora.
-
-    Other bones may lie outside of a CT of the hips.
-    """
-    there = set(ids)
-    return [
-        name
-        for name in label_table_names()
-        if {n for bone, of_bone in label_table(name).items() if bone in _OF_THE_HIPS for n in of_bone} <= there
-    ]
 
 
 def header_warnings(path: Path) -> list[str]:

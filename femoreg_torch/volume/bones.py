@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from femoreg_torch.anatomy import Anatomy, LabelTable
+from femoreg_torch.anatomy import Anatomy, LabelTable, fitting_tables
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import transform_points
 from femoreg_torch.volume.grid import Volume
@@ -65,9 +65,10 @@ def bone_labels(
 
     Where a table names a group of bones by several ids (the pelvis, say), the `landmarks` (3,), LPS mm, tell which id
     is which bone. Where both sides share an id, they are parted half-way between their landmarks. Labels that the table
-    does not name are left out where they are soft tissue. Raises `InputError` if sides cannot be parted, or none of the
-    ids occurs.
+    does not name are left out where they are soft tissue. Raises `InputError` if sides cannot be parted, or where the
+    ids are those of another table.
     """
+    _check_table(labels, table, anatomy)
     table = _with_groups_told_apart(labels, table, anatomy, landmarks)
     order = anatomy.bone_names if anatomy else ()
     names = [*(name for name in order if name in table), *(name for name in table if name not in order)]
@@ -91,6 +92,26 @@ def bone_labels(
         labels.with_data(found),
         {name: n for name, n in number.items() if n in present},
         {name: table[name] for name, n in number.items() if n not in present},
+    )
+
+
+def _check_table(labels: Volume, table: LabelTable, anatomy: Anatomy | None) -> None:
+    """Raises `InputError` where none of the table's hip bones occurs, while another table finds all bones of the hips.
+
+    The hip bones are those that outlines are compared by; ids of another table's femora may stand for muscles here.
+    """
+    if anatomy is None:
+        return
+    named = {bone for bone in table if set(anatomy.outline) & set(anatomy.members(bone))}
+    wanted = {n for bone in named for n in table[bone]}
+    there = set(torch.bincount(labels.data.flatten()).nonzero()[:, 0].tolist())
+    if not wanted or wanted & there or not (fitting := fitting_tables(there)):
+        return
+    ids = ", ".join(map(str, sorted(wanted)))
+    raise InputError(
+        f"label map: no voxel carries the {' or '.join(sorted(named))} of its table ({ids}), but hip bones and femora "
+        f"of the table {' and of '.join(fitting)} are there. Name that one: `--bones {fitting[0]}`, or "
+        f"`bones: {fitting[0]}` under `ct:` in case.yaml."
     )
 
 

@@ -15,12 +15,12 @@ from intake_files import ENTRY, HEAD, SPACING, bones, landmarks, markups, ras_af
 from pydicom.dataset import FileMetaDataset
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, XRayAngiographicImageStorage, generate_uid
 
+from femoreg_torch.anatomy import fitting_tables, label_table
 from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.fluoro import Display, read_image
 from femoreg_torch.intake import inspect_path
-from femoreg_torch.intake.volumes import fitting_tables
-from femoreg_torch.volume import read_ct, read_labels
+from femoreg_torch.volume import read_ct, read_labels, read_landmarks
 
 
 @pytest.fixture(scope="module")
@@ -448,6 +448,52 @@ def test_in_a_terminal_what_is_missing_is_asked_for(
 def test_a_table_fits_where_the_hips_do_though_other_bones_lie_outside() -> None:
     assert fitting_tables([25, 75, 76, 77, 78]) == ["totalsegmentator_v2"]  # no vertebrae, half a sacrum
     assert fitting_tables([75, 76, 77]) == []
+
+
+def test_a_table_that_is_not_that_of_the_map_is_told_with_the_one_that_is(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = label_table("totalsegmentator_v2")
+    values = np.zeros(next(iter(bones().values())).shape, np.uint8)
+    for name, mask in bones().items():
+        values[mask] = table[name][0]
+    values[:2, :2, :2] = 88  # a muscle by this table, the left femur by that of version 1
+    path = tmp_path / "map.nii.gz"
+    nibabel.save(nibabel.Nifti1Image(values, ras_affine()), path)
+    ct, out = str(files / "ct.nii.gz"), str(tmp_path / "points.mrk.json")
+    for words in (
+        arguments(files, tmp_path / "case", labels=path, bones="totalsegmentator_v1"),
+        ["landmarks", ct, str(path), "--out", out, "--bones", "totalsegmentator_v1"],
+    ):
+        assert main(words) == 2
+        told = capsys.readouterr().err
+        assert "no voxel carries the hip_left or hip_right of its table (90, 91)" in told
+        assert "Name that one: `--bones totalsegmentator_v2`" in told
+    assert main(["landmarks", ct, str(path), "--out", out]) == 2
+    assert "hip bones and femora of totalsegmentator_v2 are there" in capsys.readouterr().err
+    assert main(["landmarks", ct, str(path), "--out", out, "--bones", "totalsegmentator_v2"]) == 0
+
+
+def test_landmarks_go_by_the_names_of_the_parts_whatever_their_values(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = sitk.ReadImage(str(files / "labels.nii.gz"))
+    exchanged = sitk.ChangeLabel(image, {1: 2, 2: 1, 5: 6, 6: 5})  # values of `femoreg` with their sides exchanged
+    names = {2: "Hüftbein links", 1: "Hüftbein rechts", 4: "Kreuzbein", 6: "Femur li.", 5: "Femur re."}
+    for n, (value, name) in enumerate(names.items()):
+        for key, text in {"Name": name, "LabelValue": str(value), "Layer": "0"}.items():
+            exchanged.SetMetaData(f"Segment{n}_{key}", text)
+    sitk.WriteImage(exchanged, str(tmp_path / "mine.seg.nrrd"))
+    out = tmp_path / "points.mrk.json"
+    assert main(["landmarks", str(files / "ct.nii.gz"), str(tmp_path / "mine.seg.nrrd"), "--out", str(out)]) == 0
+    assert read_landmarks(out)["FH-l"][0] > 100
+    assert read_landmarks(out)["FH-r"][0] < -100
+    exchanged.SetMetaData("Segment0_Name", "Knochen 1")
+    exchanged.SetMetaData("Segment1_Name", "Knochen 2")
+    sitk.WriteImage(exchanged, str(tmp_path / "mine.seg.nrrd"))
+    assert main(["landmarks", str(files / "ct.nii.gz"), str(tmp_path / "mine.seg.nrrd"), "--out", str(out)]) == 2
+    told = capsys.readouterr().err
+    assert "none of its parts is named after a hip bone; those taken for no bone are: Knochen 1, Knochen 2" in told
 
 
 def test_a_folder_as_it_was_exported(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
