@@ -35,7 +35,7 @@ def segment(
     from femoreg_torch.commands.intake import write_picture
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import check_files, temporary_files, write_json
-    from femoreg_torch.intake.planes import three_planes
+    from femoreg_torch.intake.planes import planes_through_joints
     from femoreg_torch.segment import load_bone_network, segment_bones, segment_bones_without_network
     from femoreg_torch.volume import read_ct_told
     from femoreg_torch.volume.reading import write_labels_like
@@ -66,10 +66,12 @@ def segment(
         "way": way,
         "confidence": {bone: round(share, 3) for bone, share in found.confidence.items()},
         "volume_ml": {bone: round(volume_ml, 1) for bone, volume_ml in found.volume_ml.items()},
+        "head_radius_mm": {side: round(head.radius_mm, 1) for side, head in found.heads.items()},
         "warnings": list(found.warnings),
     }
     colours = {1 + n: bone.colour for n, bone in enumerate(HIP.bones)}
-    planes = three_planes(volume, found.labels, colours, {})
+    heads = {side: head.centre for side, head in found.heads.items() if head.may_be_one}
+    planes = planes_through_joints(volume, found.labels, colours, heads)
     with temporary_files(out, beside(".json"), beside(".png")) as (labels, text, picture):
         write_labels_like(labels, found.labels, ct)
         write_json(text, about)

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from femoreg_torch.geometry import transform_points
-from femoreg_torch.volume import Volume, resample_isotropic
+from femoreg_torch.volume import Volume, crop, resample_isotropic
 
 Picture = NDArray[np.uint8]  # (H, W, 3), blue, green, red
 _WINDOW_HU = (-250.0, 1000.0)
 _HEIGHT_PX = 420
+_JOINT_MM = 55.0  # to all sides of a femoral head's centre: the whole socket
 _CELL_PX, _COLUMNS = 300, 3  # of images side by side
 _ENDS_PERCENT = (0.5, 99.5)  # of the pixels, that set the window of an image
 _TINT = 0.35
@@ -30,12 +31,13 @@ def three_planes(
     colours: Mapping[int, tuple[int, int, int]],
     marks: Mapping[str, Tensor],
     centre: Tensor | None = None,
+    caption: str = "",
 ) -> Picture:
     """Axial, coronal and sagittal plane through `centre` (3,), LPS mm (by default the middle of what is labelled).
 
     `grey` is a CT in HU (anything else is shown from its least to its greatest value), `labels` a map on the same grid
     with RGB `colours` of its ids, `marks` points (3,) by name, LPS mm, drawn where they lie before or behind the plane.
-    One of `grey` and `labels` must be there.
+    One of `grey` and `labels` must be there. `caption` stands before the name of each plane.
     """
     volume = grey if grey is not None else labels
     assert volume is not None
@@ -60,9 +62,33 @@ def three_planes(
             cv2.drawMarker(panel, (round(column), round(row)), _YELLOW, cv2.MARKER_CROSS, 8, 1, cv2.LINE_AA)
             cv2.putText(panel, mark, (round(column) + 5, round(row) - 4), _FONT, 0.35, _YELLOW, 1, cv2.LINE_AA)
         left, right = ("front", "back") if axis == 0 else ("R", "L")
-        panels.append(_captioned(panel, name, left, right))
+        panels.append(_captioned(panel, f"{caption}{name}", left, right))
     height = max(panel.shape[0] for panel in panels)
     return np.hstack([cv2.copyMakeBorder(p, 0, height - p.shape[0], 0, 6, cv2.BORDER_CONSTANT) for p in panels])
+
+
+def planes_through_joints(
+    grey: Volume, labels: Volume, colours: Mapping[int, tuple[int, int, int]], heads: Mapping[str, Tensor]
+) -> Picture:
+    """Three planes of all through the middle of the femoral heads, and below them, for each head, of its joint alone.
+
+    `heads` are centres (3,), LPS mm, by side; the rest is as for `three_planes`.
+    """
+    middle = torch.stack(list(heads.values())).mean(0) if heads else None
+    picture = three_planes(grey, labels, colours, {}, middle)
+    for side, centre in heads.items():
+        around = [_around(volume, centre) for volume in (grey, labels)]
+        below = three_planes(around[0], around[1], colours, {}, centre, f"{side} hip, ")
+        picture = np.vstack(_equally_wide(picture, below))
+    return picture
+
+
+def _around(volume: Volume, centre: Tensor) -> Volume:
+    """What lies near a joint."""
+    index = transform_points(torch.linalg.inv(volume.lps_from_index), centre[None])[0]
+    reach = _JOINT_MM / torch.tensor(volume.spacing_mm, dtype=torch.float64)
+    low, high = (index - reach).round().int().tolist(), (index + reach).round().int().tolist()
+    return crop(volume, (low[0], low[1], low[2]), (high[0] + 1, high[1] + 1, high[2] + 1))
 
 
 def side_by_side(images: Mapping[str, Tensor]) -> Picture | None:
@@ -80,9 +106,15 @@ def stacked(above: Picture | None, below: Picture | None) -> Picture | None:
     """Both pictures, one below the other, or the one that is there."""
     if above is None or below is None:
         return below if above is None else above
+    return np.vstack(_equally_wide(above, below))
+
+
+def _equally_wide(above: Picture, below: Picture) -> list[Picture]:
     width = max(above.shape[1], below.shape[1])
-    wide = [cv2.copyMakeBorder(p, 0, 6, 0, width - p.shape[1], cv2.BORDER_CONSTANT) for p in (above, below)]
-    return np.vstack(wide)
+    return [
+        np.asarray(cv2.copyMakeBorder(p, 0, 6, 0, width - p.shape[1], cv2.BORDER_CONSTANT), np.uint8)
+        for p in (above, below)
+    ]
 
 
 def _cell(name: str, image: Tensor) -> Picture:

@@ -1,11 +1,13 @@
 """Bones and landmarks from a CT alone."""
 
 from femoreg_torch.segment.bones import Segmentation, segment_bones, segment_bones_without_network
+from femoreg_torch.segment.heads import Head, head_centre
 from femoreg_torch.segment.network import BoneNetwork, load_bone_network
-from femoreg_torch.segment.points import Proposal, head_centre, propose_landmarks
+from femoreg_torch.segment.points import Proposal, propose_landmarks
 
 __all__ = [
     "BoneNetwork",
+    "Head",
     "Proposal",
     "Segmentation",
     "head_centre",

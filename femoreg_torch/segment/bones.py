@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from femoreg_torch.anatomy import HIP, Anatomy
 from femoreg_torch.errors import InputError
+from femoreg_torch.segment.heads import Head, doubted_radius, fitted_heads
 from femoreg_torch.segment.network import BoneNetwork, bone_shares
 from femoreg_torch.segment.refine import closed_joint_mm2, refined_labels, unrefined_labels
 from femoreg_torch.segment.without_network import bones_without_network
@@ -37,6 +38,7 @@ class Segmentation:
     confidence: dict[str, float]  # by bone: mean probability that the network gives its voxels; empty without one
     volume_ml: dict[str, float]  # by bone
     warnings: tuple[str, ...]
+    heads: dict[str, Head]  # by side
 
 
 def segment_bones(ct: Volume, network: BoneNetwork, refine: bool = True) -> Segmentation:
@@ -116,7 +118,10 @@ def _looked_at(
             left_out.append(f"what may be {name} ({told}) was left out: the network is not sure")
     labels = Volume(data, ct.lps_from_index)
     warnings = left_out + _warnings(ct, labels, anatomy, volume_ml, confidence, hips)
-    return Segmentation(labels, confidence, volume_ml, tuple(warnings))
+    jointed = [f"{bone}_{side}" for side in hips for bone in ("hip", "femur") if side in femora]
+    heads = fitted_heads(labels, {name: 1 + anatomy.bone_names.index(name) for name in jointed})
+    warnings += [told for side, head in heads.items() for told in doubted_radius(side, head.radius_mm)]
+    return Segmentation(labels, confidence, volume_ml, tuple(warnings), heads)
 
 
 def _is_there(volume_ml: dict[str, float], doubtful: list[str], bone: str, least_ml: float) -> bool:

@@ -5,22 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import trimesh
-from scipy import ndimage
-from skimage.measure import marching_cubes
 from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
-from femoreg_torch.segment.rules import SIDES, femoral_head, find_surface_landmarks
+from femoreg_torch.segment.heads import DOUBTED_RESIDUAL_MM, HEAD_RADIUS_MM, doubted_radius
+from femoreg_torch.segment.rules import SIDES, find_surface_landmarks
+from femoreg_torch.segment.surface import STEP_MM, bone_surface
 from femoreg_torch.volume import BoneLabels, Volume
 
-_STEP_MM = 1.5  # of the grid that surfaces are drawn on; edges are then at most its diagonal
-_SMOOTH_MM = 1.0  # standard deviation of the blur that takes the voxels off a surface
 _BORDER_MM = 4.0  # a point so near to the CT's border may be where the CT ends and no landmark
 _LEAST_ML = 15.0  # of a hip bone or femur that is looked at
-_HEAD_RADIUS_MM = (15.0, 35.0)  # of femoral heads; other spheres are none
-_DOUBTED_RESIDUAL_MM = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +43,10 @@ def propose_landmarks(ct: Volume, bones: BoneLabels) -> Proposal:
     surfaces = {name: bone_surface(bones.labels, bones.ids[name]) for name in volume if volume[name] >= _LEAST_ML}
     if not any(name.startswith("hip") for name in surfaces):
         raise InputError("landmarks: the label map holds no hip bone to find landmarks on.")
-    found = find_surface_landmarks(surfaces, whole=False, edge_mm=_STEP_MM * math.sqrt(3))
+    found = find_surface_landmarks(surfaces, whole=False, edge_mm=STEP_MM * math.sqrt(3))
     points = {name: torch.from_numpy(np.asarray(point, np.float64)) for name, point in found.points.items()}
-    left_out, warnings = {}, []
+    left_out: dict[str, str] = {}
+    warnings: list[str] = []
     for name in HIP.landmark_names:
         if name not in points:
             left_out[name] = "its bone, or what is needed of it, is not in the label map"
@@ -58,9 +54,11 @@ def propose_landmarks(ct: Volume, bones: BoneLabels) -> Proposal:
             left_out[name] = "lies at the border of the CT"
     for side, radius in found.head_radius.items():
         name, residual = f"FH-{side[0]}", found.head_residual[side]
-        if not _HEAD_RADIUS_MM[0] <= radius <= _HEAD_RADIUS_MM[1]:
+        if not HEAD_RADIUS_MM[0] <= radius <= HEAD_RADIUS_MM[1]:
             left_out[name] = f"the sphere fitted to the head has a radius of {radius:.0f} mm"
-        elif residual > _DOUBTED_RESIDUAL_MM:
+            continue
+        warnings += doubted_radius(side, radius)
+        if residual > DOUBTED_RESIDUAL_MM:
             warnings.append(f"{name}: the head lies {residual:.1f} mm (root mean square) off a sphere: look at it")
     kept = {name: points[name] for name in HIP.landmark_names if name in points and name not in left_out}
     errors = {}
@@ -70,41 +68,6 @@ def propose_landmarks(ct: Volume, bones: BoneLabels) -> Proposal:
             residual = found.head_residual.get(side, 0.0) if landmark.name.startswith("FH") else 0.0
             errors[landmark.name] = _expected_error(landmark.spread_mm, ct.spacing_mm, residual)
     return Proposal(kept, errors, found.head_radius, found.head_residual, left_out, tuple(warnings))
-
-
-def head_centre(bones: BoneLabels, side: str) -> Tensor | None:
-    """Centre (3,), LPS mm, of the sphere that fits a femoral head; None where bones are missing or it is no sphere."""
-    names = [f"{bone}_{side}" for bone in ("femur", "hip")]
-    if not set(names) <= set(bones.ids):
-        return None
-    sphere, residual = femoral_head(*(bone_surface(bones.labels, bones.ids[name]) for name in names))
-    if not _HEAD_RADIUS_MM[0] <= sphere[3] <= _HEAD_RADIUS_MM[1] or residual > _DOUBTED_RESIDUAL_MM:
-        return None
-    return torch.from_numpy(sphere[:3].copy())
-
-
-def bone_surface(labels: Volume, number: int) -> trimesh.Trimesh:
-    """The closed surface of a label, LPS mm, on nodes of 1.5 mm, its voxels smoothed off."""
-    inside = torch.nonzero(labels.data == number)
-    low, high = inside.min(0).values, inside.max(0).values + 1
-    part = (labels.data[low[0] : high[0], low[1] : high[1], low[2] : high[2]] == number).numpy().astype(np.float32)
-    spacing = np.array(labels.spacing_mm)[::-1]
-    room = np.ceil((3 * _SMOOTH_MM + 1) / spacing).astype(int)
-    smooth = ndimage.gaussian_filter(np.pad(part, [(n, n) for n in room]), _SMOOTH_MM / spacing)
-    zoom = spacing / _STEP_MM
-    if (np.abs(zoom - 1) > 0.1).any():
-        counts = np.maximum(2, np.round((np.array(smooth.shape) - 1) * zoom).astype(int) + 1)
-        axes = [np.linspace(0, n - 1, count) for n, count in zip(smooth.shape, counts, strict=True)]
-        steps = [axis[1] for axis in axes]
-        smooth = ndimage.map_coordinates(smooth, np.meshgrid(*axes, indexing="ij"), order=1)
-    else:
-        steps = [1.0] * 3
-    vertices, faces, _, _ = marching_cubes(smooth, 0.5)
-    index = vertices * steps - room + low.numpy()
-    affine = labels.lps_from_index.numpy()
-    mesh = trimesh.Trimesh(index[:, ::-1] @ affine[:3, :3].T + affine[:3, 3], faces, process=False)
-    parts = mesh.split(only_watertight=False)
-    return max(parts, key=lambda part: len(part.faces)) if len(parts) else mesh
 
 
 def _well_inside(point: Tensor, ct: Volume) -> bool:

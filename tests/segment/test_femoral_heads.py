@@ -1,0 +1,76 @@
+"""Femoral heads of a label map: that their size is an adult's, and that a picture goes through them."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hip_scenes import HEAD, RADIUS_MM, answering, hip_scene, shares_of
+
+from femoreg_torch.commands.main import main
+from femoreg_torch.intake.planes import planes_through_joints
+from femoreg_torch.segment.heads import fitted_heads
+from femoreg_torch.volume import Volume, axis_aligned, write_volume
+
+SPACING = 1.5
+RED, BLUE = (255, 0, 0), (0, 0, 255)
+
+
+def scaled(scale: float) -> tuple[Volume, Volume, np.ndarray]:
+    """CT, label map and labels of a hip whose header makes it larger or smaller by `scale`."""
+    ct, truth = hip_scene((SPACING,) * 3)
+    affine = ct.lps_from_index.clone()
+    affine[:3] *= scale
+    return Volume(ct.data, affine), Volume(torch.from_numpy(truth), affine), truth
+
+
+@pytest.mark.parametrize(("scale", "doubted"), [(0.7, True), (0.8, False), (1.0, False), (1.3, False), (1.5, True)])
+def test_a_head_that_no_adult_has_is_a_warning(
+    scale: float, doubted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ct, labels, truth = scaled(scale)
+    write_volume(tmp_path / "ct.nii.gz", ct)
+    write_volume(tmp_path / "known.nii.gz", labels)
+    network = answering(shares_of(truth, (SPACING * scale,) * 3))
+    monkeypatch.setattr("femoreg_torch.segment.load_bone_network", lambda path: network)
+    assert main(["segment", str(tmp_path / "ct.nii.gz"), "--out", str(tmp_path / "labels.nii.gz")]) == 0
+    told = json.loads((tmp_path / "labels.json").read_text(encoding="utf-8"))
+    assert told["head_radius_mm"]["left"] == pytest.approx(RADIUS_MM * scale, abs=0.5)
+    words = "the left femoral head has a radius of"
+    assert any(words in warning for warning in told["warnings"]) == doubted
+    assert (words in capsys.readouterr().out) == doubted
+    ct_path, known = str(tmp_path / "ct.nii.gz"), str(tmp_path / "known.nii.gz")
+    assert main(["landmarks", ct_path, known, "--out", str(tmp_path / "points.json")]) == 0
+    assert (words in capsys.readouterr().out) == doubted
+
+
+def test_a_head_without_its_socket_is_not_looked_for() -> None:
+    _, labels, _ = scaled(1.0)
+    assert fitted_heads(labels, {"femur_left": 5}) == {}
+    (head,) = fitted_heads(labels, {"femur_left": 5, "hip_left": 1}).values()
+    np.testing.assert_allclose(head.centre, HEAD, atol=0.5)
+
+
+def test_the_planes_go_through_the_heads_and_show_each_joint_large() -> None:
+    """Two balls low in a volume, with much bone above them, which draws the middle of all bone away."""
+    affine = axis_aligned((2.0, 2.0, 2.0), (-120.0, -80.0, -200.0))
+    z, y, x = np.meshgrid(np.arange(150), np.arange(80), np.arange(120), indexing="ij")
+    place = np.stack([x, y, z], -1) * 2.0 + [-120.0, -80.0, -200.0]
+    heads = {"left": np.array([70.0, 10.0, -120.0]), "right": np.array([-70.0, 10.0, -120.0])}
+    labels = np.zeros(x.shape, np.uint8)
+    labels[z > 90] = 3
+    for number, centre in enumerate(heads.values(), 1):
+        labels[np.linalg.norm(place - centre, axis=-1) < 24] = number
+    ct, bones = (Volume(torch.from_numpy(data), affine) for data in (np.zeros(x.shape, np.float32), labels))
+    points = {side: torch.from_numpy(centre) for side, centre in heads.items()}
+    picture = planes_through_joints(ct, bones, {1: RED, 2: BLUE}, points)
+    red, blue = ((picture[..., channel] > 60) & (picture[..., 1] < 10) for channel in (2, 0))
+    joint = picture.shape[0] - 2 * (426 + 6)  # rows of the picture of all
+    above = math.pi * 24**2 / (300 / 420) ** 2  # pixels of a ball's largest disc where 300 mm are 420 pixels
+    large = math.pi * 24**2 / (114 / 420) ** 2  # and where some 114 mm are: 55 mm to each side, and voxels of 2 mm
+    assert red[:joint].sum() == pytest.approx(2 * above, rel=0.05)  # the axial and the coronal plane of all
+    assert blue[:joint].sum() == pytest.approx(2 * above, rel=0.05)
+    assert red[joint : joint + 430].sum() == pytest.approx(3 * large, rel=0.05)
+    assert blue[joint + 430 :].sum() == pytest.approx(3 * large, rel=0.05)
