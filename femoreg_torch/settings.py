@@ -43,6 +43,8 @@ _REFUSED = re.compile(
 )
 _KEY = re.compile(r'Parser key "([^"]*)": (.*)')
 _WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text"}
+_WORDS_OF_MANY = {"int": "whole numbers", "float": "numbers", "str": "texts", "Path": "paths"}
+LIST = "a list"  # how `told` begins where one was expected
 
 
 def told(error: Exception) -> str:
@@ -58,6 +60,8 @@ def _in_words(found: re.Match[str]) -> str:
     kinds = found[1] or found[2]
     if choice := re.fullmatch(r"typing\.Literal\[(.*)\]", kinds):
         kinds = f"one of {choice[1]}"
+    elif listed := re.fullmatch(r"list(?:\[(?:\w+\.)*(\w+)\])?", kinds):
+        kinds = f"{LIST}{f' of {_WORDS_OF_MANY[listed[1]]}' if listed[1] in _WORDS_OF_MANY else ''}"
     else:
         kinds = ", ".join(_WORDS.get(kind, kind) for kind in kinds.split(", "))
     return f"{kinds} was expected, found {shortened(found[3])}"

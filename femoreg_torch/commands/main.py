@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 GROUP = "femoreg_torch.commands"
 _LONGEST = 2000  # characters of a complaint
 _REQUIRED = "the following arguments are required"  # as argparse says it
+_LIST_IN_A_SHELL = """'[A, B]'; an item with commas or brackets needs quotes of its own, '["A=[1, 2]", B]'"""
 # Objects made before Python looks for rings of forgotten ones: imports make hundreds of thousands that stay. With
 # Python's own 700 the search takes a seventh of the time of `import torch`.
 _COLLECTED_AFTER = 50_000, 20, 20
@@ -232,7 +233,7 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
     """Keyword arguments for `function`. Raises `InputError` for what does not fit its signature."""
     from jsonargparse import ArgumentError
 
-    from femoreg_torch.settings import told
+    from femoreg_torch.settings import LIST, told
     from femoreg_torch.text import check_no_aliases
 
     for word in arguments:
@@ -253,6 +254,8 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
             raise InputError(f"{name}: {_missing(name, known.values(), rest)}. See `femoreg {name} --help`.") from error
         if key in known and (known[key].kind is known[key].KEYWORD_ONLY or known[key].default is not known[key].empty):
             key = f"--{key.replace('_', '-')}"
+            if rest.strip().startswith(LIST):
+                rest += f". Write {key} {_LIST_IN_A_SHELL}"
         raise InputError(f"{name}: {key}{colon}{rest}. See `femoreg {name} --help`.") from error
     for key, (low, high) in _RANGES.items():
         if isinstance(value := values.get(key), int | float) and not low <= value <= high:

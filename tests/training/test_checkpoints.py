@@ -101,7 +101,8 @@ def test_weights_of_other_landmarks_to_start_with_are_one_line(
 def test_a_word_in_place_of_a_list_is_told_briefly(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "quick", "--out", str(tmp_path / "out"), "--override", "x"]) == 2
     told = capfd.readouterr().err
-    assert "list[str] was expected" in told
+    assert "--override: a list of texts was expected, found 'x'" in told
+    assert "--override '[A, B]'" in told
     assert "class" not in told
     assert told.count("\n") == 1
 
