@@ -103,7 +103,9 @@ def read_dicom(path: Path, frames: Frames | None) -> DicomImage:
         raise
     except Exception as error:  # pydicom's readers and decoders raise whatever their parsing runs into
         reason = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: the DICOM file holds no image that can be decoded ({reason}).") from error
+        raise InputError(
+            f"{path}: the DICOM file holds no image that can be decoded ({reason}). Export it uncompressed."
+        ) from error
 
 
 def _read(path: Path, frames: Frames | None) -> DicomImage:
@@ -212,7 +214,11 @@ def _by_gdcm(dataset: Any) -> Values:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "image.dcm"
         bare.save_as(path, enforce_file_format=True)
-        values = sitk.GetArrayFromImage(sitk.ReadImage(str(path), imageIO="GDCMImageIO"))
+        try:
+            values = sitk.GetArrayFromImage(sitk.ReadImage(str(path), imageIO="GDCMImageIO"))
+        except RuntimeError as error:  # which names lines of ITK's source
+            kind = dataset.file_meta.TransferSyntaxUID.name
+            raise RuntimeError(f"compressed as {kind}, and damaged or of a kind that is not read") from error
     return values if values.ndim > 2 else values[None]
 
 

@@ -188,7 +188,7 @@ def choose_series(path: Path, wanted: str | None = None) -> Series:
         chosen = [one for one in there if one.may_be_volume]
     if len(chosen) == 1:
         return chosen[0]
-    listed = ", ".join(one.told for one in chosen or there)
+    listed = _listed(chosen or there)
     if wanted is not None:
         how = f"{len(chosen)} of its series are {wanted!r}" if chosen else f"none of its series is {wanted!r}"
         raise InputError(f"{folder}: {how}; there are: {listed}. Give one's number, its UID or a part of its name.")
@@ -196,8 +196,15 @@ def choose_series(path: Path, wanted: str | None = None) -> Series:
         raise InputError(f"{folder}: none of its DICOM series is a volume; there are: {listed}. Choose another folder.")
     raise InputError(
         f"{folder}: holds {len(chosen)} DICOM series, one was expected: {listed}. Choose one: by its number, its UID "
-        "or a part of its name, `--series` of `femoreg new-case`, or by the path of one of its files in case.yaml."
+        "or a part of its name with `--series`, or by the path of one of its files in case.yaml."
     )
+
+
+def _listed(series: Sequence[Series]) -> str:
+    """The series in a few words each; with the UIDs of those that nothing else tells apart."""
+    names = [(one.number, one.description) for one in series]
+    alone = [any(name) and names.count(name) == 1 for name in names]
+    return ", ".join(one.told if known else f"{one.told} {one.uid}" for one, known in zip(series, alone, strict=True))
 
 
 def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:

@@ -8,8 +8,10 @@ import pytest
 import SimpleITK as sitk
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import (
+    MPEG2MPML,
     ExplicitVRBigEndian,
     ExplicitVRLittleEndian,
+    RLELossless,
     SecondaryCaptureImageStorage,
     XRayAngiographicImageStorage,
 )
@@ -175,6 +177,16 @@ def test_compressed_images_are_the_same(tmp_path: Path, compressor: str) -> None
     dataset["PixelData"].is_undefined_length = True
     dataset.save_as(path, enforce_file_format=True)
     with pytest.raises(InputError, match=r"run\.dcm: the DICOM file holds no image that can be decoded"):
+        read_stored(path)
+
+
+def test_a_compression_that_is_not_read_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    dataset = pydicom.dcmread(path)
+    dataset.compress(RLELossless)
+    dataset.file_meta.TransferSyntaxUID = MPEG2MPML
+    dataset.save_as(path, enforce_file_format=True)
+    with pytest.raises(InputError, match=r"\(compressed as MPEG2 .*not read\)\. Export it uncompressed\.$"):
         read_stored(path)
 
 

@@ -220,6 +220,21 @@ def test_one_of_several_series_is_chosen(tmp_path: Path) -> None:
         read_ct_told(folder, "7")
 
 
+@pytest.mark.parametrize("named", [{"number": 3}, {"number": 3, "SeriesNumber": None, "SeriesDescription": ""}])
+def test_series_that_numbers_and_names_do_not_tell_apart_are_listed_with_what_does(named: dict, tmp_path: Path) -> None:
+    folder = tmp_path / "dicom"
+    write_series(folder, **named)
+    for path in list(folder.iterdir()):
+        path.rename(path.with_name(f"a{path.name}"))
+    write_series(folder, **named)
+    first, second = series_in(folder)
+    with pytest.raises(InputError, match="holds 2 DICOM series") as told:
+        read_ct(folder)
+    assert first.uid in str(told.value)
+    assert second.uid in str(told.value)
+    assert read_ct_told(folder, second.uid)[0].data.shape == SIZE
+
+
 def test_a_scout_beside_one_series_is_passed_over_and_copies_count_once(tmp_path: Path) -> None:
     folder = tmp_path / "dicom"
     write_series(folder, number=3)
