@@ -79,7 +79,9 @@ def check_files(*paths: Path) -> None:
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: is there and is no file, so it is not replaced. Choose another name.")
         if not os.access(path.parent, os.W_OK | os.X_OK):
-            raise InputError(f"{path}: cannot be written, {path.parent} is read-only or not yours. Choose another place.")
+            raise InputError(
+                f"{path}: cannot be written, {path.parent} is read-only or not yours. Choose another place."
+            )
 
 
 @contextmanager
@@ -145,7 +147,9 @@ def check_folder(path: Path, sources: Iterable[Path] = ()) -> Path:
     if missing > _MOST_NEW or any(len(os.fsencode(name)) > _LONGEST_NAME for name in names):
         raise InputError(f"{shortened(real, 200)}: its name, or the path to it, is too long. Choose another one.")
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        raise InputError(f"{real}: cannot be written, {above} is no folder, read-only or not yours. Choose another place.")
+        raise InputError(
+            f"{real}: cannot be written, {above} is no folder, read-only or not yours. Choose another place."
+        )
     return real
 
 

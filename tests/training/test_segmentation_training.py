@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from femoreg_torch.anatomy import HIP
+from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 from femoreg_torch.segment import load_bone_network
 from training.segmentation.learn import (
@@ -123,6 +124,15 @@ def test_a_run_is_resumed_and_its_weights_are_read(tmp_path: Path) -> None:
     checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
     with pytest.raises(InputError, match=r"checkpoint\.pt: is cut off"):
         train_segmentation(replace(settings, steps=4), paths, out, tmp_path, True, told.append)
+
+
+def test_a_shape_that_is_not_there_is_told_before_a_folder_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing, out = tmp_path / "none.npz", tmp_path / "run"
+    assert main(["train-segmentation", "bones6", "--shapes", f"[{missing}]", "--out", str(out)]) == 2
+    assert f"--shapes: there is no file {missing}" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_the_shipped_settings_can_be_read() -> None:

@@ -25,7 +25,7 @@ from femoreg_torch.settings import SEEDS, check_within, read_record
 from models.volume_unet import VolumeUNetSettings
 from models.weights import Weights, save_weights
 from training.segmentation.scans import Scan, ScanSettings, random_scan
-from training.segmentation.shapes import BoneShape, cached_shapes
+from training.segmentation.shapes import BoneShape, cached_shapes, check_shapes
 
 WEIGHTS_NAME = "bones6.safetensors"
 _WARM_UP = 50  # steps with a rising learning rate
@@ -119,6 +119,7 @@ def train_segmentation(
         raise InputError(f"{checkpoint}: no such file, so there is nothing to resume. Leave out --resume.")
     if checkpoint.is_file() and not resume:
         raise InputError(f"{out}: holds a training run. Continue it with --resume, or choose another folder.")
+    check_shapes(shapes, cache)
     torch.set_num_threads(settings.threads)
     out.mkdir(parents=True, exist_ok=True)
     tell(f"reading {len(shapes)} shapes")

@@ -80,6 +80,13 @@ def read_shape(path: Path, spine: BoneShape | None = None) -> BoneShape:
     return BoneShape(path.name.split(".")[0], distance, first, spheres[:, :3], spheres[:, 3], not cut)
 
 
+def check_shapes(paths: list[Path], cache: Path) -> None:
+    """Raises `InputError` for a file that is not there, and not in `cache` either."""
+    for path in paths:
+        if not path.is_file() and not _kept(path, cache).is_file():
+            raise InputError(f"--shapes: there is no file {path}.")
+
+
 def cached_shapes(paths: list[Path], cache: Path) -> list[BoneShape]:
     """The shapes of these files, from `cache` where it has them; vertebrae are lent by the first that has some."""
     cache.mkdir(parents=True, exist_ok=True)
@@ -87,7 +94,7 @@ def cached_shapes(paths: list[Path], cache: Path) -> list[BoneShape]:
     spines: list[BoneShape] = []
     shapes: list[BoneShape] = []
     for path in sorted(paths, key=lambda path: "pelvic_ref" not in path.name):
-        kept = cache / f"{path.name.split('.')[0]}.npz"
+        kept = _kept(path, cache)
         if not kept.is_file():
             lender = None if "pelvic_ref" in path.name or not spines else spines[len(shapes) % len(spines)]
             _save(read_shape(path, lender), kept)
@@ -96,6 +103,10 @@ def cached_shapes(paths: list[Path], cache: Path) -> list[BoneShape]:
         if "pelvic_ref" in path.name:
             spines.append(shape)
     return shapes
+
+
+def _kept(path: Path, cache: Path) -> Path:
+    return cache / f"{path.name.split('.')[0]}.npz"
 
 
 def _save(shape: BoneShape, path: Path) -> None:
