@@ -43,7 +43,8 @@ def tip_length(
 ) -> TipLength | None:
     """Of a device at its pose, whose guide runs from one point (3,) mm to the tip, in its own space.
 
-    None where the images of that kind do not show the place of the tip, or what is saturated hides it.
+    None where the images of that kind do not show the place of the tip, what is saturated hides it, or the model has
+    nothing there.
     """
     base, tip = (point.double() for point in guide)
     axis = (tip - base) / (tip - base).norm()
@@ -52,7 +53,10 @@ def tip_length(
     if not images:
         return None
     thing = scene.objects[name]
-    rest, end = _parted(thing.volume, tip, axis)
+    parted = _parted(thing.volume, tip, axis)
+    if parted is None:
+        return None
+    rest, end = parted
     names = f"{name}, without its tip", f"{name}, its tip"
     objects = [
         RigidObject(part, thing.reference_point, thing.shown_in, sharp=thing.sharp, hardening=thing.hardening)
@@ -107,14 +111,19 @@ def _near_the_tip(scene: Scene, poses: Poses, name: str, kind: Kind, tip: Tensor
     return near
 
 
-def _parted(volume: Volume, tip: Tensor, axis: Tensor) -> tuple[Volume, Volume]:
-    """All but a box around the end of a guide; and that box, with room for the guide to grow, on a grid of its own."""
+def _parted(volume: Volume, tip: Tensor, axis: Tensor) -> tuple[Volume, Volume] | None:
+    """All but a box around the end of a guide; and that box, with room for the guide to grow, on a grid of its own.
+
+    None if the box lies beside the volume.
+    """
     inverse, size = torch.linalg.inv(volume.lps_from_index), torch.tensor(volume.data.shape).flip(0)
     ends = torch.stack([tip - _STRETCH_MM[1] * axis, tip + _LONGEST_MM * axis])
     low, high = ends.amin(0) - _AROUND_MM, ends.amax(0) + _AROUND_MM
     corners = transform_points(inverse, torch.cartesian_prod(*torch.stack([low, high]).T))
     first, last = corners.amin(0).floor().long(), corners.amax(0).ceil().long()
     inside_first, inside_last = first.clamp_min(0).minimum(size), (last + 1).clamp_min(0).minimum(size)
+    if not bool((inside_first < inside_last).all()):
+        return None
     x, y, z = (slice(int(a), int(b)) for a, b in zip(inside_first, inside_last, strict=True))
     rest = volume.data.clone()
     rest[z, y, x] = 0

@@ -137,10 +137,17 @@ def test_a_tip_that_no_image_shows_is_not_asked(scene: Scene) -> None:
     assert tip_length(scene, TRUTH.with_object("device", pose), "device", "device", (BASE, TIP), PLAIN) is None
 
 
+def test_a_tip_beside_its_model_is_not_asked(scene: Scene) -> None:
+    for tip in (float64(0, 0, 400), float64(0, -300, 40)):
+        assert tip_length(scene, TRUTH, "device", "device", (BASE, tip), PLAIN) is None
+
+
 @pytest.mark.parametrize("mm", [-4, -1, 0, 3])
 def test_an_end_is_drawn_out_by_so_much_and_all_else_stays(mm: int) -> None:
     whole, axis = tool(), float64(0, 0, 1)
-    rest, end = _parted(whole, TIP, axis)
+    parted = _parted(whole, TIP, axis)
+    assert parted is not None
+    rest, end = parted
     drawn_out = _stretched(end, TIP, axis, mm)
     shift = ((end.lps_from_index[:3, 3] - whole.lps_from_index[:3, 3]) / 1.0).round().int().tolist()
     column = drawn_out.data[:, 24 - shift[1], 24 - shift[0]]
