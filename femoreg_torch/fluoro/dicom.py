@@ -104,7 +104,7 @@ def read_dicom(path: Path, frames: Frames | None) -> DicomImage:
     except Exception as error:  # pydicom's readers and decoders raise whatever their parsing runs into
         reason = " ".join(str(error).split())[:200]
         raise InputError(
-            f"{path}: the DICOM file holds no image that can be decoded ({reason}). Export it uncompressed."
+            f"{path}: the DICOM file holds no image that can be decoded ({reason}). Export it anew, uncompressed."
         ) from error
 
 

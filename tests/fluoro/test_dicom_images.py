@@ -186,7 +186,7 @@ def test_a_compression_that_is_not_read_is_named(tmp_path: Path) -> None:
     dataset.compress(RLELossless)
     dataset.file_meta.TransferSyntaxUID = MPEG2MPML
     dataset.save_as(path, enforce_file_format=True)
-    with pytest.raises(InputError, match=r"\(compressed as MPEG2 .*not read\)\. Export it uncompressed\.$"):
+    with pytest.raises(InputError, match=r"\(compressed as MPEG2 .*not read\)\. Export it anew, uncompressed\.$"):
         read_stored(path)
 
 
