@@ -1,5 +1,6 @@
 """Replay of a registration: edges of the structures over the fluoroscopy, moment by moment as the search went on."""
 
+import errno
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,11 +78,14 @@ def _write_gif(path: Path, pictures: Iterator[Picture], durations: list[int]) ->
 
 
 def write_film(path: Path, pictures: Iterator[Picture], durations: list[int]) -> None:
-    """Write pictures (H, W, 3), each shown for so many milliseconds, as a film in the format of the path's suffix."""
+    """Write pictures (H, W, 3), each shown for so many milliseconds, as a film in the format of the path's suffix.
+
+    Raises `OSError` if it is cut off, of which ffmpeg says nothing.
+    """
     import imageio_ffmpeg
 
     codec, *options = _CODECS[path.suffix.lower()]
-    writer = None
+    writer, sent = None, 0
     for picture, milliseconds in zip(pictures, durations, strict=True):
         rows, columns, _ = picture.shape
         even = np.pad(picture, ((0, rows % 2), (0, columns % 2), (0, 0)), mode="edge")  # as the codecs need it
@@ -99,8 +103,16 @@ def write_film(path: Path, pictures: Iterator[Picture], durations: list[int]) ->
             writer.send(None)
         for _ in range(max(1, round(milliseconds * _FPS / 1000))):
             writer.send(np.ascontiguousarray(even))
-    if writer is not None:
-        writer.close()
+            sent += 1
+    if writer is None:
+        return
+    writer.close()
+    try:
+        written = imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+    except RuntimeError:  # no film at all
+        written = 0
+    if written < sent:
+        raise OSError(errno.ENOSPC, "cannot be written whole. Is the disk full?")
 
 
 def frames_of(result: Result, scene: Scene) -> Iterator[Frame]:

@@ -11,6 +11,7 @@ Layout (xregH5ProjDataIO.cpp, xregH5CamModelIO.cpp, xregHDF5Internal.h):
     proj-000/rot-to-pat-up               0, 90, 180, 270: degrees that turn the picture head up
 """
 
+import errno
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from femoreg_torch.geometry import invert_rigid, read_itk_transform
 from femoreg_torch.hdf5 import Hdf5File, open_hdf5
 from femoreg_torch.neighbours.frames import XregCamera
 
+_SAME_MM = 1e-6  # by which a pose that was written may differ
 _MOST_PROJECTIONS = 1000  # names have three digits
 
 
@@ -94,5 +96,10 @@ def write_transform(path: Path, matrix: Tensor) -> None:
     with temporary_file(Path(path)) as part:
         try:
             sitk.WriteTransform(transform, str(part))
-        except RuntimeError as error:  # ITK does not say why
-            raise OSError(f"{path}: cannot be written") from error
+            written = read_transform(part)
+        except (RuntimeError, InputError) as error:  # ITK does not say why
+            raise OSError(errno.EIO, "cannot be written. Is the disk full?", str(path)) from error
+        if not torch.allclose(
+            written, matrix.double().cpu(), rtol=0, atol=_SAME_MM
+        ):  # it does not say that a text was cut off
+            raise OSError(errno.ENOSPC, "cannot be written whole. Is the disk full?", str(path))

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from fuzz_faults import full_after
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -211,6 +212,17 @@ def test_a_film_shows_every_picture_for_as_long_as_it_is_told(suffix: str, tmp_p
     assert bright.count(False) / rate == pytest.approx(0.4, abs=0.05)
     assert bright.count(True) / rate == pytest.approx(0.8, abs=0.05)
     assert shown[0].shape == (64, 96, 3)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".webm"])
+def test_a_film_that_a_full_disk_cuts_off_is_told(suffix: str, tmp_path: Path) -> None:
+    noise = np.random.default_rng(1).integers(0, 255, (4, 64, 96, 3), dtype=np.uint8)
+    path = tmp_path / f"film{suffix}"
+    write_film(path, iter(noise), [400] * 4)
+    size = path.stat().st_size
+    for most in (200, size // 2):
+        with full_after(most), pytest.raises(OSError, match="Is the disk full"):
+            write_film(path, iter(noise), [400] * 4)
 
 
 def test_a_film_needs_the_extra(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from fuzz_faults import full_after
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
@@ -156,6 +157,18 @@ def test_itk_transforms_come_back(tmp_path: Path, name: str) -> None:
     torch.testing.assert_close(read_transform(tmp_path / name), pose, atol=1e-9, rtol=0)
     with pytest.raises((InputError, OSError)):
         write_transform(tmp_path / "none" / name, pose)
+
+
+def test_a_transform_that_a_full_disk_cuts_off_is_told(tmp_path: Path) -> None:
+    """As text; where HDF5 cannot close a file, ITK says so, and the process cannot end in order any more."""
+    path, pose = tmp_path / "pose.tfm", torch.from_numpy(lps_from_world())
+    write_transform(path, pose)
+    size = path.stat().st_size
+    path.unlink()
+    for missing in (30, 60, size // 2):
+        with full_after(size - missing), pytest.raises(OSError, match=r"disk full|too large"):
+            write_transform(path, pose)
+        assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("part", "value", "told"), [
