@@ -11,7 +11,7 @@ def phantom(out: Path, *, seed: int = 1, side: Literal["left", "right"] = "left"
         out: Folder to write; `femoreg simulate` takes it as its case.
         seed: The same seed gives the same patient and device.
         side: Hip to be operated.
-        spacing_mm: Voxel size of the CT.
+        spacing_mm: Voxel size of the CT, 0.5 to 2 mm.
     """
     from rich.console import Console
 
