@@ -144,6 +144,10 @@ def test_the_wrong_table_in_a_case(tmp_path: Path) -> None:
     told = refusal(case_folder(tmp_path / "a", first_ids("totalsegmentator_v2"), "totalsegmentator_v1"))
     assert told.startswith(f"{tmp_path}/a/bones of it.nii.gz: label map: no voxel carries the hip_left or hip_right")
     assert "`bones: totalsegmentator_v2` under `ct:` in case.yaml" in told
+    none_fits = {bone: 200 + n for bone, n in first_ids("femoreg").items()}
+    told = refusal(case_folder(tmp_path / "b", none_fits, "totalsegmentator_v1"))
+    assert "no voxel is told to be hip_left, hip_right, femur_left, femur_right. It holds the ids 201, 202" in told
+    assert f"{tmp_path}/b/case.yaml" in told
 
 
 def test_sides_that_are_exchanged(tmp_path: Path) -> None:
