@@ -4,6 +4,7 @@ from femoreg_torch.optimize.bobyqa import Bobyqa
 from femoreg_torch.optimize.cmaes import CmaEs
 from femoreg_torch.optimize.kinds import read_optimiser
 from femoreg_torch.optimize.levenberg import LevenbergMarquardt
+from femoreg_torch.optimize.parabola import parabola_minimum
 from femoreg_torch.optimize.quadratic import Quadratic, SmoothObjective
 from femoreg_torch.optimize.result import BestSoFar, Objective, Optimiser, Result, Stop
 
@@ -18,5 +19,6 @@ __all__ = [
     "Result",
     "SmoothObjective",
     "Stop",
+    "parabola_minimum",
     "read_optimiser",
 ]

@@ -1,11 +1,10 @@
-"""What speaks against a result besides the quality of its objects.
+"""What speaks against a result besides the quality of its objects and what `device_doubts` asks of a device's model.
 
-The C-arm's file, its poses, the plan, models that the images do not show as they are, and what may be mirrored.
+The C-arm's file, its poses, the plan, images that show something else, and what may be mirrored, bent or broken.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from itertools import chain
 
 import torch
@@ -14,23 +13,23 @@ from scipy.spatial import cKDTree
 from femoreg_torch.case import Case
 from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.cores import on_all_cores
-from femoreg_torch.errors import in_mm
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Poses, pose_difference, transform_points
-from femoreg_torch.registration.besides import besides, rival
-from femoreg_torch.registration.calibration import devices
 from femoreg_torch.registration.covariance import PoseCovariance
+from femoreg_torch.registration.device_doubts import (
+    doubts_about_size,
+    doubts_about_the_models,
+    doubts_about_units,
+    doubts_beside_devices,
+)
 from femoreg_torch.registration.handedness import handedness
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.misfits import misfits
-from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM
 from femoreg_torch.registration.motion import MotionBetween
 from femoreg_torch.registration.orbit import orbits
 from femoreg_torch.registration.quality import Limits, shift_px
 from femoreg_torch.registration.rigidity import CUTS, bend
 from femoreg_torch.registration.scene import Scene
-from femoreg_torch.registration.sizes import size
-from femoreg_torch.registration.tips import TipLength, tip_length
 
 # A mobile C-arm that turns about its orbit comes back within some mm and degrees (the paper draws 2 mm and 1°), and
 # sags by a few mm more. A mirrored image ended 121 mm and 10° off.
@@ -56,8 +55,6 @@ _MOST_SHIFT = 0.9
 # away.
 _MOST_FROM_BONE_MM = 12.0
 _ALONG = 40  # points of the path that are looked at
-_CASTS_NO_SHADOW = 0.004  # 1/mm: a fifth of water
-_MOST_WITHOUT_SHADOW = 0.08  # share of a model's volume
 # Of the mean patch Grad-NCC. Seen on simulated procedures: mirror images fit worse by 0.01 to 0.06; where the CT was
 # mirrored, better by 0.04.
 _BETTER_MIRRORED = 0.005
@@ -74,17 +71,6 @@ _SURE_OF_BREAK = 4.0
 # label maps too, at most 0.00014; where a leg had moved as a whole 0.0032, with its ends 0.1 mm apart.
 _LEAST_GAIN_OF_BEND = 0.0002
 _GAIN_OF_BREAK, _APART_OF_BREAK_MM = 0.0008, 0.8
-# Another place of a device, of the similarity that it adds where it was found, without its best view: of wires beside
-# another one 0.44 and 0.48; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
-_AS_GOOD_ELSEWHERE = 0.37
-# Of a device beside its model, mm, and what a model of that length gains of the similarity near the tip. Seen of 24
-# right devices of a foreign simulator: at most 0.5 mm, with a gain of 0.002; of eight whose tip was 2 to 3 mm off, with
-# what was estimated 1.1 to 3.3 mm and 0.03 to 0.6, or, where the estimate had emptied the model's tip, as it was told
-# 1.0 to 1.5 mm too long.
-_MOST_OFF_TIP_MM, _LEAST_GAIN_OF_TIP = 0.8, 0.01
-# Seen of 24 right devices there: at most 0.7 % and a gain of nothing; of models 2 and 3 % off 1.7 to 2.8 % and 0.0006
-# to 0.002.
-_MOST_OFF_SIZE, _LEAST_GAIN_OF_SIZE = 0.01, 0.0003
 
 
 def doubts(
@@ -97,12 +83,8 @@ def doubts(
     """
     displays = [case.display_of(view) for view in range(len(case.views))]
     if strange := doubts_about_the_images(scene, poses, imaging):
-        return (
-            *doubts_about_units(case, told),
-            *strange,
-            *doubts_about_the_plan(case, scene),
-            *doubts_about_the_guide(case, poses),
-        )
+        plan = *doubts_about_the_plan(case, scene), *doubts_about_the_guide(case, poses)
+        return (*doubts_about_units(case, told, True), *strange, *plan)
     others: list[Callable[[], tuple[str, ...]]] = [
         lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
@@ -114,12 +96,12 @@ def doubts(
     first = on_all_cores(lambda ask: ask(), others, scene.device)
     clear = scene.where_unsaturated()
     found = (
-        *doubts_about_units(case, told),
-        *doubts_about_size(case, told.where_unsaturated(), clear, poses, imaging),
+        *doubts_about_size(case, told, clear, poses, imaging),
         *chain(*first),
         *doubts_about_handedness(scene, poses, imaging),
         *doubts_about_rigidity(clear, poses, imaging),
     )
+    found = (*doubts_about_units(case, told, bool(found)), *found)
     return (*found, *doubts_beside_devices(clear, poses, imaging, bool(found)))
 
 
@@ -149,39 +131,6 @@ def doubts_about_the_images(scene: Scene, poses: Poses, imaging: Imaging) -> tup
                 f"{what} fits nowhere within {_ORBIT_DEG:.0f}° of view 1 {beside}: check that it shows the same hip of "
                 "the same patient, and that little covers it; a C-arm that stood elsewhere needs its poses "
                 "(`camera_from_camera1` of the views)"
-            )
-    return tuple(told)
-
-
-def doubts_beside_devices(scene: Scene, poses: Poses, imaging: Imaging, in_doubt: bool) -> tuple[str, ...]:
-    """Other things that a device may have been taken for, in words.
-
-    If there is another doubt, also what else came or went between the images, as that may be its cause. Where something
-    came and something went in one view, the patient has moved, which is asked elsewhere.
-    """
-    told = []
-    for name, kind in devices(scene, poses):
-        seen = [found for found in besides(scene, poses, name, kind) if found.more != found.less]
-        came, went = ([found.view + 1 for found in seen if getattr(found, way)] for way in ("more", "less"))
-        other = None
-        if len(came) >= min(2, len(scene.there([kind], range(scene.views)))):
-            other = rival(scene, poses, name, kind, imaging)
-        if other is not None and other.share > _AS_GOOD_ELSEWHERE:
-            fits = "" if other.share >= 1 else f"{100 * other.share:.0f} % "
-            told.append(
-                f"the {kind} images show something else of the shape of the {name}, {other.apart_mm:.0f} mm beside it, "
-                f"which it fits {fits}as well: no image tells which of the two it is; take the other one out of view "
-                "and register again"
-            )
-        elif came and in_doubt:
-            told.append(
-                f"the {kind} images of view {' and '.join(map(str, came))} show something besides the {name} that the "
-                "other images lack (cement, a hand, a clamp?): it may be what the other doubts come from"
-            )
-        if went and in_doubt:
-            told.append(
-                f"the images without the {name} of view {' and '.join(map(str, went))} show something that those with "
-                f"it lack (the {name} itself?): it may be what the other doubts come from"
             )
     return tuple(told)
 
@@ -324,84 +273,6 @@ def doubts_about_the_guide(case: Case, poses: Poses) -> tuple[str, ...]:
         f"the guide of the {case.plan.tool} points against the planned path: are its points `tip` and `base` "
         "exchanged, or entry point and target of the plan? Is `side` the one that is treated?",
     )
-
-
-def doubts_about_units(case: Case, told: Scene) -> tuple[str, ...]:
-    """Models that are likely told in another unit than mm, or points of them that are, in words."""
-    found = []
-    for name, thing in case.objects.items():
-        if thing.model is None or name not in told.objects:
-            continue
-        points, volume = thing.points, told.objects[name].volume
-        far = [point for point, place in points.items() if volume.beyond_mm(place) > BEYOND_MM]
-        length = float((points["tip"] - points["base"]).norm()) if {"base", "tip"} <= set(points) else GUIDE_MM[0]
-        if far or not GUIDE_MM[0] <= length <= GUIDE_MM[1]:
-            what = f"its point {far[0]} lies far outside its model" if far else f"its guide is {in_mm(length)} long"
-            found.append(f"the {name}: {what}: are model and points in mm? (Inches are 25.4 of them.)")
-    return tuple(found)
-
-
-def doubts_about_the_models(told: Scene, scene: Scene) -> tuple[str, ...]:
-    """Models of which a part was found to attenuate next to nothing, in words."""
-    found = []
-    for name, thing in scene.objects.items():
-        before = told.objects[name].volume.data
-        inside = before > 0.5 * before.max()
-        share = float((thing.volume.data[inside] < _CASTS_NO_SHADOW).double().mean())
-        if share > _MOST_WITHOUT_SHADOW:
-            found.append(
-                f"{100 * share:.0f} % of the {name}'s volume casts no shadow: check that its model is the one in the "
-                "images, and not mirrored, and that its nominal pose is not far off (see the preset fast_wide_device)"
-            )
-    return tuple(found)
-
-
-def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
-    """Devices that the images show larger or smaller than their models, or with another tip, in words.
-
-    Where a model ends beyond the device, its end may have been estimated to be empty; so it is asked as told, too.
-    """
-    found = []
-    for name, kind in devices(scene, poses):
-        words = []
-        shown = size(scene, poses, name, kind, imaging)
-        if abs(shown.factor - 1) > _MOST_OFF_SIZE and shown.gain > _LEAST_GAIN_OF_SIZE:
-            words.append(
-                f"the {name} about {100 * abs(shown.factor - 1):.1f} % "
-                f"{'larger' if shown.factor > 1 else 'smaller'} than its model, beside the bones"
-            )
-        off = _tip_elsewhere(case, told, scene, poses, name, kind, imaging)
-        if off is not None:
-            words.append(
-                f"the guide of the {name} end {abs(off.longer_mm):.1f} mm "
-                f"{'beyond' if off.longer_mm > 0 else 'before'} the tip of its model"
-            )
-        if words:
-            found.append(
-                f"the images show {' and '.join(words)}: check that the model is the one in the images, its length, "
-                "its size and their unit, and the voxel size of the CT"
-            )
-    return tuple(found)
-
-
-def _tip_elsewhere(
-    case: Case, told: Scene, scene: Scene, poses: Poses, name: str, kind: str, imaging: Imaging
-) -> TipLength | None:
-    """Where a guide ends in the images, if that is not where its model does."""
-    points = case.objects[name].points
-    if not {"base", "tip"} <= set(points):
-        return None
-    guide = points["base"], points["tip"]
-    as_told = replace(scene, objects=scene.objects | {name: told.objects[name]})
-    found, if_told = (tip_length(of, poses, name, kind, guide, imaging) for of in (scene, as_told))
-    off = [] if found is None or not _ends_elsewhere(found) else [found]
-    if if_told is not None and if_told.longer_mm < 0 and _ends_elsewhere(if_told):
-        off.append(if_told)
-    return max(off, key=lambda each: each.gain, default=None)
-
-
-def _ends_elsewhere(found: TipLength) -> bool:
-    return abs(found.longer_mm) > _MOST_OFF_TIP_MM and found.gain > _LEAST_GAIN_OF_TIP
 
 
 def doubts_about_handedness(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:

@@ -19,9 +19,7 @@ from femoreg_torch.volume import (
 )
 
 MODEL_SPACING_MM = 0.5  # a sleeve's wall is thinner than a CT voxel
-BEYOND_MM = (
-    25.0  # a point outside the box of its model: a drill may stand out of a sleeve; or units and axes are others
-)
+BEYOND_MM = 25.0  # of a point outside the box of its model: a drill stands out of a sleeve, or the unit is another
 GUIDE_MM = (20.0, 600.0)  # from base to tip; a model in metres, inches or µm is likely beyond
 
 

@@ -24,6 +24,7 @@ from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import CArm, Poses, pose_difference, transform_points
+from femoreg_torch.optimize import parabola_minimum
 from femoreg_torch.registration.covariance import PoseCovariance, pose_covariance
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
@@ -322,11 +323,6 @@ def _assess_view(scene: Scene, poses: Poses, name: str, image: tuple[Kind, int],
     drawing = image_costs(scene, local, (body,), drawn, [image], _LEVEL, _SIMILARITY, imaging=imaging)
     costs = drawing(probes)[:, 0].tolist()
     without = float(drawing.without_what_moves()[0])
-    pull = (_minimum(costs[1], costs[0], costs[2]) * _PROBE_MM, _minimum(costs[3], costs[0], costs[4]) * _PROBE_MM)
-    return ViewQuality(view + 1, 1 - costs[0], without - costs[0], pull)
-
-
-def _minimum(before: float, here: float, after: float) -> float:
-    """Where a parabola through three values, one step apart, has its minimum; nan if it has none."""
-    curvature = before - 2 * here + after
-    return (before - after) / (2 * curvature) if curvature > 0 else float("nan")
+    across = parabola_minimum(costs[1], costs[0], costs[2]) * _PROBE_MM
+    down = parabola_minimum(costs[3], costs[0], costs[4]) * _PROBE_MM
+    return ViewQuality(view + 1, 1 - costs[0], without - costs[0], (across, down))

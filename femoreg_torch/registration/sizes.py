@@ -1,17 +1,20 @@
 """Is a device as large as its model? The images are asked whether they fit it better, scaled.
 
-A model of another size in the series, or in other units, is placed where it fits on the whole: the larger one nearer to
-the detector. Between views from several sides that does not work out. Nor does it where the CT's voxel size is wrong,
-as the C-arm's poses follow the bones.
+A model that is too large is placed nearer to the detector, where its image is as large as the device's. But views from
+several sides do not agree on such a place. They do not either where the voxel size of the CT is wrong, as the C-arm's
+poses follow the bones. One view alone tells no size.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from femoreg_torch.cores import on_all_cores
+from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
-from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.optimize import LevenbergMarquardt, parabola_minimum
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, stage_objective
@@ -35,13 +38,19 @@ class Size:
     gain: float  # of mean patch Grad-NCC, by the best size that was tried
 
 
-def size(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -> Size:
-    """Of a device, in the images of a kind, its pose fitted to each size; all else stays where it is."""
+def device_size(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -> Size | None:
+    """How large the images of a kind show a device, its pose fitted to each size; all else stays where it is.
+
+    None where an image leaves nothing to compare, as where all of it is saturated.
+    """
     images = scene.there([kind], range(scene.views))
     thing = scene.objects[name]
     body = Body((name,), 0, reference_point_in_view(scene, poses, name, 0), torch.tensor(_SCALE, dtype=torch.float64))
     shown = scene.shown(poses.camera1_from, kind)
-    costs = image_costs(scene, poses, (body,), shown, images, _LEVEL, _SIMILARITY, imaging=imaging)
+    try:
+        costs = image_costs(scene, poses, (body,), shown, images, _LEVEL, _SIMILARITY, imaging=imaging)
+    except InputError:
+        return None
     drawn = costs.objects[name]
 
     def fitted(factor: float) -> float:
@@ -50,13 +59,13 @@ def size(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) ->
         return _OPTIMISER.minimise(objective, len(costs.still), seed=0).value
 
     less, equal, more = on_all_cores(fitted, [1 - _STEP, 1.0, 1 + _STEP], scene.device)
-    bend = less - 2 * equal + more
-    steps = (less - more) / (2 * bend) if bend > 0 else 0.0
-    return Size(1 + _STEP * min(max(steps, -_FURTHEST), _FURTHEST), equal - min(less, equal, more))
+    steps = parabola_minimum(less, equal, more)
+    steps = 0.0 if math.isnan(steps) else min(max(steps, -_FURTHEST), _FURTHEST)
+    return Size(1 + _STEP * steps, equal - min(less, equal, more))
 
 
-def _scaled(volume: Volume, factor: float, centre: torch.Tensor) -> Volume:
-    """A volume that is larger by a factor about a point (3,) mm, and casts the same shadow per voxel."""
+def _scaled(volume: Volume, factor: float, centre: Tensor) -> Volume:
+    """A volume that is larger by a factor about a point (3,) mm, and casts as dark a shadow."""
     larger = torch.eye(4, dtype=torch.float64)
     larger[:3, :3] *= factor
     larger[:3, 3] = (1 - factor) * centre

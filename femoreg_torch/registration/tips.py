@@ -1,11 +1,11 @@
 """Does a guide end in the images where its model ends?
 
-A tip is a small part of a device. Were it some mm longer than its model, all else of the device would still lie where
-it is, and hardly any similarity over the whole images would be lost. But the tip is what is steered. So the last
-centimetres of the model are drawn out and pushed together along the guide, and the images near the tip are asked which
-length they show.
+A tip is a small part of a device. If it is some mm longer than its model, all else of the device still lies where it
+is, and hardly any similarity over the whole images is lost. But the tip is what is steered. So the last 14 mm of the
+model are stretched and compressed along the guide, and the images near the tip tell which length they show.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, project_points, transform_points
+from femoreg_torch.optimize import parabola_minimum
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs
@@ -24,9 +25,9 @@ from femoreg_torch.volume import Volume
 
 _LEVEL = Level(pixel_mm=1.55, step_mm=0.75)
 _SIMILARITY = GradNcc(patch_radius=3)
-_LONGEST_MM = 4  # by which the model is drawn out or pushed together, in steps of 1 mm
-_STRETCH_MM = 6.0, 14.0  # before the tip: where the model is drawn out; nearer to the tip it keeps its shape
-_AROUND_MM = 12.0  # of the guide's axis: what is drawn out, and, on the plane of the tip, what is looked at
+_LONGEST_MM = 4  # by which the model is stretched or compressed, in steps of 1 mm
+_STRETCH_MM = 6.0, 14.0  # before the tip: where the model is stretched; nearer to the tip it keeps its shape
+_AROUND_MM = 12.0  # of the end of the guide: the box that is stretched, and, at the depth of the tip, what is looked at
 _LEAST_PIXELS = 200  # of an image, near the tip, for it to count
 
 
@@ -41,7 +42,9 @@ class TipLength:
 def tip_length(
     scene: Scene, poses: Poses, name: str, kind: Kind, guide: tuple[Tensor, Tensor], imaging: Imaging
 ) -> TipLength | None:
-    """Of a device at its pose, whose guide runs from one point (3,) mm to the tip, in its own space.
+    """How much longer than its model the images of a kind show a device, at its pose.
+
+    Its guide runs from one point (3,) mm to the tip, both in its own space.
 
     None where the images of that kind do not show the place of the tip, what is saturated hides it, or the model has
     nothing there.
@@ -84,9 +87,8 @@ def tip_length(
 
     found = on_all_cores(cost, lengths, scene.device)
     best = min(max(min(range(len(found)), key=lambda n: found[n]), 1), len(found) - 2)
-    before, here, after = found[best - 1 : best + 2]
-    bend = before - 2 * here + after
-    between = min(max((before - after) / (2 * bend), -1.0), 1.0) if bend > 0 else 0.0
+    aside = parabola_minimum(*found[best - 1 : best + 2])
+    between = 0.0 if math.isnan(aside) else min(max(aside, -1.0), 1.0)
     return TipLength(lengths[best] + between, found[_LONGEST_MM] - min(found))
 
 
@@ -134,7 +136,7 @@ def _parted(volume: Volume, tip: Tensor, axis: Tensor) -> tuple[Volume, Volume] 
 
 
 def _stretched(volume: Volume, tip: Tensor, axis: Tensor, mm: float) -> Volume:
-    """A volume whose last centimetres along an axis are drawn out by so much; pushed together where it is negative."""
+    """A volume whose end along an axis is stretched by so much; compressed where it is negative."""
     data = volume.data
     size = torch.tensor(data.shape).flip(0)
     x, y, z = (torch.arange(n, dtype=torch.float64) for n in size.tolist())

@@ -68,12 +68,12 @@ def bone_labels(
     does not name are left out where they are soft tissue. Raises `InputError` if sides cannot be parted, or where the
     ids are those of another table.
     """
-    _check_table(labels, table, anatomy)
+    counts = torch.bincount(labels.data.flatten()).numpy()
+    _check_table(set(np.flatnonzero(counts).tolist()), table, anatomy)
     table = _with_groups_told_apart(labels, table, anatomy, landmarks)
     order = anatomy.bone_names if anatomy else ()
     names = [*(name for name in order if name in table), *(name for name in table if name not in order)]
     data = labels.data.numpy()
-    counts = torch.bincount(labels.data.flatten()).numpy()
     # bones of the anatomy have their own numbers, whatever else is in the table
     number = {name: 1 + order.index(name) for name in names if name in order}
     number |= {name: n for n, name in enumerate((name for name in names if name not in order), 1 + len(order))}
@@ -95,8 +95,8 @@ def bone_labels(
     )
 
 
-def _check_table(labels: Volume, table: LabelTable, anatomy: Anatomy | None) -> None:
-    """Raises `InputError` where none of the table's hip bones occurs, while another table finds all bones of the hips.
+def _check_table(there: set[int], table: LabelTable, anatomy: Anatomy | None) -> None:
+    """Raises `InputError` where no hip bone of the table is `there`, but another table finds all bones of the hips.
 
     The hip bones are those that outlines are compared by; ids of another table's femora may stand for muscles here.
     """
@@ -104,7 +104,6 @@ def _check_table(labels: Volume, table: LabelTable, anatomy: Anatomy | None) -> 
         return
     named = {bone for bone in table if set(anatomy.outline) & set(anatomy.members(bone))}
     wanted = {n for bone in named for n in table[bone]}
-    there = set(torch.bincount(labels.data.flatten()).nonzero()[:, 0].tolist())
     if not wanted or wanted & there or not (fitting := fitting_tables(there)):
         return
     ids = ", ".join(map(str, sorted(wanted)))

@@ -12,7 +12,7 @@ from femoreg_torch.drr import project
 from femoreg_torch.geometry import Poses, centred_camera
 from femoreg_torch.registration import Scene
 from femoreg_torch.registration.besides import _share, besides, rival
-from femoreg_torch.registration.doubts import doubts_beside_devices
+from femoreg_torch.registration.device_doubts import doubts_beside_devices
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.volume import Volume, axis_aligned
 

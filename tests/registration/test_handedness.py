@@ -9,7 +9,8 @@ from registration_scenes import CARM, REFERENCE_POINTS, VOLUMES, float64, make_s
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import transform_points
 from femoreg_torch.registration import Scene
-from femoreg_torch.registration.doubts import doubts_about_handedness, doubts_about_the_models
+from femoreg_torch.registration.device_doubts import doubts_about_the_models
+from femoreg_torch.registration.doubts import doubts_about_handedness
 from femoreg_torch.registration.handedness import handedness, mirror_images
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.volume import Volume, axis_aligned

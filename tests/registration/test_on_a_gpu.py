@@ -38,7 +38,7 @@ from femoreg_torch.geometry import centred_camera, first_view_only
 from femoreg_torch.optimize import LevenbergMarquardt, SmoothObjective
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, run_plan
 from femoreg_torch.registration.calibration import Calibration
-from femoreg_torch.registration.doubts import doubts_about_the_models
+from femoreg_torch.registration.device_doubts import doubts_about_the_models
 from femoreg_torch.registration.handedness import handedness
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.objective import image_costs, stage_objective

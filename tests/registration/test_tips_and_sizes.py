@@ -12,10 +12,10 @@ from torch.nn import functional as F
 from femoreg_torch.case import Case, CaseObject, Model, Start
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import CArm, centred_camera
-from femoreg_torch.registration.doubts import doubts_about_size, doubts_about_units
+from femoreg_torch.registration.device_doubts import doubts_about_size, doubts_about_units
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.scene import RigidObject, Scene
-from femoreg_torch.registration.sizes import size
+from femoreg_torch.registration.sizes import device_size
 from femoreg_torch.registration.tips import _parted, _stretched, tip_length
 from femoreg_torch.volume import Volume, axis_aligned
 
@@ -84,7 +84,9 @@ def test_a_device_as_its_model_has_it_is_not_doubted(scene: Scene) -> None:
     assert tip is not None
     assert abs(tip.longer_mm) < 0.3
     assert tip.gain < 0.005
-    assert size(scene, TRUTH, "device", "device", PLAIN).factor == pytest.approx(1, abs=0.004)
+    shown = device_size(scene, TRUTH, "device", "device", PLAIN)
+    assert shown is not None
+    assert shown.factor == pytest.approx(1, abs=0.004)
     assert doubts_about_size(CASE, scene, scene, TRUTH, PLAIN) == ()
 
 
@@ -110,7 +112,9 @@ def test_a_tip_that_was_estimated_to_be_empty_is_asked_as_it_was_told(scene: Sce
 @pytest.mark.parametrize(("factor", "words"), [(1.03, "smaller"), (0.97, "larger")])
 def test_a_model_of_another_size_is_told(scene: Scene, factor: float, words: str) -> None:
     wrong = with_model(scene, larger(tool(), factor))
-    assert size(wrong, TRUTH, "device", "device", PLAIN).factor == pytest.approx(1 / factor, abs=0.012)
+    shown = device_size(wrong, TRUTH, "device", "device", PLAIN)
+    assert shown is not None
+    assert shown.factor == pytest.approx(1 / factor, abs=0.012)
     (doubt,) = doubts_about_size(CASE, wrong, wrong, TRUTH, PLAIN)
     assert words in doubt
     assert "than its model, beside the bones" in doubt
@@ -126,9 +130,22 @@ def test_a_model_of_another_size_is_told(scene: Scene, factor: float, words: str
 )
 def test_models_and_points_in_other_units_are_told(scene: Scene, base: Tensor, tip: Tensor, words: str | None) -> None:
     device = CaseObject("device", model=Model(Path("device.stl"), 5000.0), points={"base": base, "tip": tip})
-    doubts = doubts_about_units(replace(CASE, objects={"device": device}), scene)
+    doubts = doubts_about_units(replace(CASE, objects={"device": device}), scene, True)
     assert len(doubts) == (words is not None)
     assert words is None or words in doubts[0]
+
+
+def test_a_tip_that_stands_far_out_of_its_model_is_no_doubt_by_itself(scene: Scene) -> None:
+    device = CaseObject("device", model=Model(Path("device.stl"), 5000.0), points={"base": BASE, "tip": 3 * TIP})
+    assert doubts_about_units(replace(CASE, objects={"device": device}), scene, False) == ()
+    assert len(doubts_about_units(replace(CASE, objects={"device": device}), scene, True)) == 1
+
+
+def test_an_image_that_is_saturated_as_a_whole_is_no_error(scene: Scene) -> None:
+    whole = torch.ones(CARM.camera.shape, dtype=torch.bool)
+    clear = replace(scene, saturated={"device": (None, whole, None)}).where_unsaturated()
+    assert device_size(clear, TRUTH, "device", "device", PLAIN) is None
+    assert doubts_about_size(CASE, scene, clear, TRUTH, PLAIN) == ()
 
 
 def test_a_tip_that_no_image_shows_is_not_asked(scene: Scene) -> None:

@@ -1,0 +1,143 @@
+"""What speaks against a device's model, in words: its unit, its size, its tip, parts without a shadow, and rivals."""
+
+from dataclasses import replace
+
+from femoreg_torch.case import Case
+from femoreg_torch.errors import in_mm
+from femoreg_torch.geometry import Poses
+from femoreg_torch.registration.besides import besides, rival
+from femoreg_torch.registration.calibration import devices
+from femoreg_torch.registration.imaging import Imaging
+from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM
+from femoreg_torch.registration.scene import Kind, Scene
+from femoreg_torch.registration.sizes import device_size
+from femoreg_torch.registration.tips import TipLength, tip_length
+
+_CASTS_NO_SHADOW = 0.004  # 1/mm: a fifth of water
+_MOST_WITHOUT_SHADOW = 0.08  # share of a model's volume
+# Another place of a device, of the similarity that it adds where it was found, without its best view: of wires beside
+# another one 0.44 and 0.48; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
+_AS_GOOD_ELSEWHERE = 0.37
+# Of a tip beside that of its model, mm, and what a model of that length gains of the similarity near the tip.
+# Seen of 38 right devices of two foreign simulators: at most 0.54 mm and 0.002. Of nine tips 2 to 4 mm off, eight were
+# told: five by 1.1 to 3.3 mm and 0.018 to 0.22, and three, whose end the estimate had emptied, by the model as told
+# alone, which was 0.8 to 1.5 mm too long. As told, right ones were at most 0.4 mm too long, but 1.9 mm too short.
+_MOST_OFF_TIP_MM, _LEAST_GAIN_OF_TIP = 0.8, 0.01
+# Seen of the same 38: at most 0.9 %, with no gain. Of five models 2 and 3 % off: 1.9 to 3.2 %, and 0.0007 to 0.002.
+_MOST_OFF_SIZE, _LEAST_GAIN_OF_SIZE = 0.01, 0.0003
+
+
+def doubts_about_units(case: Case, told: Scene, in_doubt: bool) -> tuple[str, ...]:
+    """Models that are likely told in another unit than mm, or points of them that are, in words.
+
+    A drill may stand far out of a sleeve whose model lacks it, so points outside a model are told if there is another
+    doubt.
+    """
+    found = []
+    for name, thing in case.objects.items():
+        if thing.model is None or name not in told.objects:
+            continue
+        points, volume = thing.points, told.objects[name].volume
+        far = [point for point, place in points.items() if in_doubt and volume.beyond_mm(place) > BEYOND_MM]
+        length = float((points["tip"] - points["base"]).norm()) if {"base", "tip"} <= set(points) else GUIDE_MM[0]
+        if far or not GUIDE_MM[0] <= length <= GUIDE_MM[1]:
+            what = f"its point {far[0]} lies far outside its model" if far else f"its guide is {in_mm(length)} long"
+            found.append(f"the {name}: {what}: are model and points in mm? (Inches are 25.4 of them.)")
+    return tuple(found)
+
+
+def doubts_about_the_models(told: Scene, scene: Scene) -> tuple[str, ...]:
+    """Models of which a part was found to attenuate next to nothing, in words."""
+    found = []
+    for name, thing in scene.objects.items():
+        before = told.objects[name].volume.data
+        inside = before > 0.5 * before.max()
+        share = float((thing.volume.data[inside] < _CASTS_NO_SHADOW).double().mean())
+        if share > _MOST_WITHOUT_SHADOW:
+            found.append(
+                f"{100 * share:.0f} % of the {name}'s volume casts no shadow: check that its model is the one in the "
+                "images, and not mirrored, and that its nominal pose is not far off (see the preset fast_wide_device)"
+            )
+    return tuple(found)
+
+
+def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
+    """Devices that the images show larger or smaller than their models, or with another tip, in words.
+
+    `told` is the scene as the case tells it, `scene` the one with what was estimated of the images. Where a model is
+    longer than the device, its end may have been estimated to be empty; so the model as told is asked for its tip, too.
+    """
+    found = []
+    for name, kind in devices(scene, poses):
+        words = []
+        shown = device_size(scene, poses, name, kind, imaging)
+        if shown is not None and abs(shown.factor - 1) > _MOST_OFF_SIZE and shown.gain > _LEAST_GAIN_OF_SIZE:
+            words.append(
+                f"the {name} about {100 * abs(shown.factor - 1):.1f} % "
+                f"{'larger' if shown.factor > 1 else 'smaller'} than its model, beside the bones"
+            )
+        off = _tip_elsewhere(case, told, scene, poses, name, kind, imaging)
+        if off is not None:
+            words.append(
+                f"the guide of the {name} end {abs(off.longer_mm):.1f} mm "
+                f"{'beyond' if off.longer_mm > 0 else 'before'} the tip of its model"
+            )
+        if words:
+            found.append(
+                f"the images show {', and '.join(words)}: check that the model is the one in the images, its length, "
+                "size and unit, and the voxel size of the CT"
+            )
+    return tuple(found)
+
+
+def _tip_elsewhere(
+    case: Case, told: Scene, scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging
+) -> TipLength | None:
+    """Where a guide ends in the images, if that is not where its model does."""
+    points = case.objects[name].points
+    if not {"base", "tip"} <= set(points):
+        return None
+    guide = points["base"], points["tip"]
+    as_told = replace(scene, objects=scene.objects | {name: told.objects[name]})
+    found, if_told = (tip_length(of, poses, name, kind, guide, imaging) for of in (scene, as_told))
+    off = [] if found is None or not _ends_elsewhere(found) else [found]
+    if if_told is not None and if_told.longer_mm < 0 and _ends_elsewhere(if_told):
+        off.append(if_told)
+    return max(off, key=lambda each: each.gain, default=None)
+
+
+def _ends_elsewhere(found: TipLength) -> bool:
+    return abs(found.longer_mm) > _MOST_OFF_TIP_MM and found.gain > _LEAST_GAIN_OF_TIP
+
+
+def doubts_beside_devices(scene: Scene, poses: Poses, imaging: Imaging, in_doubt: bool) -> tuple[str, ...]:
+    """Other things that a device may have been taken for, in words.
+
+    If there is another doubt, also what else came or went between the images, as that may be its cause. Where something
+    came and something went in one view, the patient has moved, which is asked elsewhere.
+    """
+    told = []
+    for name, kind in devices(scene, poses):
+        seen = [found for found in besides(scene, poses, name, kind) if found.more != found.less]
+        came, went = ([found.view + 1 for found in seen if getattr(found, way)] for way in ("more", "less"))
+        other = None
+        if len(came) >= min(2, len(scene.there([kind], range(scene.views)))):
+            other = rival(scene, poses, name, kind, imaging)
+        if other is not None and other.share > _AS_GOOD_ELSEWHERE:
+            fits = "" if other.share >= 1 else f"{100 * other.share:.0f} % "
+            told.append(
+                f"the {kind} images show something else of the shape of the {name}, {other.apart_mm:.0f} mm beside it, "
+                f"which it fits {fits}as well: no image tells which of the two it is; take the other one out of view "
+                "and register again"
+            )
+        elif came and in_doubt:
+            told.append(
+                f"the {kind} images of view {' and '.join(map(str, came))} show something besides the {name} that the "
+                "other images lack (cement, a hand, a clamp?): it may be what the other doubts come from"
+            )
+        if went and in_doubt:
+            told.append(
+                f"the images without the {name} of view {' and '.join(map(str, went))} show something that those with "
+                f"it lack (the {name} itself?): it may be what the other doubts come from"
+            )
+    return tuple(told)
