@@ -7,10 +7,13 @@ tests check the kernels in this way wherever they run.
 import functools
 import importlib
 import importlib.util
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -18,6 +21,8 @@ from femoreg_torch.drr.bricks import RIM
 from femoreg_torch.drr.device_bricks import bricked_on_device, padded_shape
 from femoreg_torch.geometry.camera import Camera
 from femoreg_torch.volume.grid import Volume
+
+Array = NDArray[np.float64]
 
 TILE = 8  # rays along the edge of a tile
 WARPS = 1  # per tile, so that its rays agree on a leap without a barrier
@@ -65,8 +70,9 @@ def project(
     """Line integrals (B, H, W) float32 of a volume for `affines` (B, 3, 4), index from camera mm.
 
     Samples lie whole steps beyond `offsets` (B,) mm. Differentiable in both (float64), and in the volume's data, which
-    may be float16 or bfloat16: sums are float32 all the same. The gradient by `affines` is the same in every run, that
-    by the data to rounding only (it needs atomics). A pose that is not finite gives an image of nan: to raise an error
+    may be float16 or bfloat16: sums are float32 all the same. `affines` and `offsets` may lie on the CPU where they
+    need no gradient. The gradient by `affines` is the same in every run, that by the data to rounding only (it needs
+    atomics). A pose that is not finite gives an image of nan: to raise an error
     would mean to wait for the device. `tile` is a power of two: the rays along the edge of a tile, which leap together.
     """
     image: Tensor = _Projection.apply(volume.data, affines, offsets, volume, camera, step_mm, tile)
@@ -74,18 +80,25 @@ def project(
 
 
 def jacobian(
-    volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, offsets: Tensor, step_mm: float, tile: int = TILE
+    volume: Volume,
+    affines: Array,
+    changes: Array,
+    rates: Array,
+    camera: Camera,
+    offsets: Array,
+    step_mm: float,
+    tile: int = TILE,
 ) -> tuple[Tensor, Tensor]:
-    """Line integrals (B, H, W) and their derivatives (B, H, W, n).
+    """Line integrals (B, H, W) and their derivatives (B, n, H, W).
 
-    `changes` (B, n, 3, 4) are the derivatives of `affines` (B, 3, 4) with respect to the n parameters, all float64.
-    Samples stay whole steps beyond `offsets` (B,) mm.
-    `tile` is as for `project`.
+    `changes` (B, n, 3, 4) are the derivatives of `affines` (B, 3, 4) with respect to the n parameters.
+    Samples stay whole steps beyond `offsets` (B,) mm, which change by `rates` (B, n). `tile` is as for `project`.
     """
     image = volume.data.new_empty((len(affines), *camera.shape), dtype=torch.float32)
-    derivatives = image.new_empty((*image.shape, changes.shape[1]))
-    outputs = (changes.contiguous(), changes.shape[1], image, derivatives)
-    _launch(_kernels().jacobian, _contents(volume), volume, affines, camera, offsets, step_mm, tile, outputs)
+    derivatives = image.new_empty((len(affines), changes.shape[1], *camera.shape))
+    placed, first, *moved = (torch.from_numpy(numbers) for numbers in (affines, offsets, changes, rates))
+    outputs = (changes.shape[1], image, derivatives)
+    _launch(_kernels().jacobian, _contents(volume), volume, placed, camera, first, step_mm, tile, outputs, moved)
     return image, derivatives
 
 
@@ -154,21 +167,36 @@ def _launch(
     step_mm: float,
     tile: int,
     outputs: tuple[Tensor | int, ...],
+    moved: Sequence[Tensor] = (),
 ) -> None:
-    """Run a kernel, one program per tile and pose; all take these arguments in this order."""
+    """Run a kernel, one program per tile and pose; all take these arguments in this order.
+
+    What lies on the CPU of `affines`, `offsets` and `moved` goes to the device by one copy.
+    """
     geometry = torch.tensor([camera.sdd_mm, *camera.pixel_mm, *camera.principal_point_px, step_mm], dtype=torch.float64)
     padded_affines = affines.detach().to(torch.float64, memory_format=torch.contiguous_format, copy=True)
     padded_affines[:, :, 3] += RIM
+    poses = [padded_affines, offsets.detach().to(torch.float64), *moved]
+    geometry, padded_affines, offsets, *moved = _on_the_device([geometry, *poses], volume.data.device)
     with torch.cuda.device_of(volume.data):  # Triton launches on the current device
         kernel[(_tiles(camera, tile), len(affines))](
             *contents,
             padded_affines,
-            geometry.to(affines.device, non_blocking=True),
-            offsets.detach().to(torch.float64).contiguous(),
+            geometry,
+            offsets,
             *padded_shape(volume.data.shape),
             *camera.shape,
+            *moved,
             *outputs,
             tile=tile,
             num_warps=WARPS,
             enable_fp_fusion=True,
         )
+
+
+def _on_the_device(numbers: Sequence[Tensor], device: torch.device) -> list[Tensor]:
+    """Float64 numbers in the order in which they lie in memory, there; those of the CPU by one copy."""
+    here = [each for each in numbers if each.device.type == "cpu"]
+    flat = torch.cat([each.flatten() for each in here]).to(device, non_blocking=True)
+    arrived = iter(flat.split([each.numel() for each in here]))
+    return [next(arrived) if each.device.type == "cpu" else each.contiguous() for each in numbers]

@@ -24,6 +24,8 @@ class DeviceBricks:
     version: int
 
 
+_FARTHEST = 12  # bricks that a leap tells; each takes some calls when a volume is made
+
 _cache: WeakKeyDictionary[Volume, DeviceBricks] = WeakKeyDictionary()
 
 
@@ -71,10 +73,13 @@ def _filled(padded: Tensor) -> Tensor:
 
 
 def _leaps(filled: Tensor) -> Tensor:
-    """Chessboard distance (Z, Y, X) of each brick from the nearest filled one, by growing these one brick at a time."""
+    """Chessboard distance (Z, Y, X) of each brick from the nearest filled one, by growing these one brick at a time.
+
+    Those farther off than the farthest that is told are leapt over in several leaps.
+    """
     distance = torch.zeros_like(filled)
     # From one end of the volume to the other in any case: to stop when all are reached would mean to wait and look.
-    for _ in range(min(max(filled.shape), 255)):
+    for _ in range(min(max(filled.shape), _FARTHEST)):
         distance += 1 - filled
         filled = max_pool3d(filled, 3, 1, 1)
     return distance[0].to(torch.uint8)

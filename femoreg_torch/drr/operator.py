@@ -17,7 +17,7 @@ from femoreg_torch.drr import cpu, cuda
 from femoreg_torch.drr.bricks import bricked
 from femoreg_torch.drr.moments import affine_gradient, offset_gradient, unit_rays
 from femoreg_torch.drr.reference import march
-from femoreg_torch.drr.sampling import middle_index, middle_of, offset_rates, offsets_of
+from femoreg_torch.drr.sampling import middle_index, middle_of, offsets_of
 from femoreg_torch.errors import InputError, in_mm, shortened
 from femoreg_torch.geometry.camera import Camera
 from femoreg_torch.geometry.rigid import skew
@@ -32,6 +32,8 @@ _MOST_SAMPLES = 1e6
 # inverse of a pose that is singular, or lies out of this world, has more, or nan.
 _MOST_VOXELS = 1e12
 _LAST_ROW, _ROUNDING = np.array([0.0, 0.0, 0.0, 1.0]), 1e-4  # poses may be float16
+_SPINS = skew(torch.eye(3, dtype=torch.float64)).numpy()  # about each axis
+_NO_DISTANCE = 1e-12  # mm from the source: of a volume whose middle lies in it
 
 
 def project(
@@ -92,7 +94,8 @@ def project_with_jacobian(
     The twist moves the object after its pose: about `centre` (3,) in mm in the camera frame, along the camera's axes,
     (rotation in rad, translation in mm), taken at zero. With `intrinsics`, three more columns (B, H, W, 9) are the
     derivatives by the intrinsics: the logarithm of the source distance, and the principal point along x and y in mm on
-    the detector. In memory the derivatives lie image by image, not pixel by pixel. `camera_from_volume` is (B, 4, 4).
+    the detector. In memory the derivatives lie image by image, not pixel by pixel. `camera_from_volume` is (B, 4, 4);
+    poses that lie on a device are waited for.
     On the CPU, or on CUDA with Triton; raises `InputError` where it cannot, and as `project` does.
     """
     _check_tensor(camera_from_volume)
@@ -103,74 +106,64 @@ def project_with_jacobian(
     _check([volume], camera_from_volume[:, None], camera, step_mm)
     if centre.shape != (3,):
         raise InputError(f"project_with_jacobian: a centre of shape (3,) is needed, got {tuple(centre.shape)}.")
-    with torch.no_grad():
-        index_from_camera = _index_from_camera(volume, camera_from_volume, step_mm)
-        affines = index_from_camera[:, :3]
-        middle = middle_of(volume, camera_from_volume)
-        generators = _twist_generators(centre.to(index_from_camera))
-        velocities = (generators[:, :3, :3] @ middle[:, None, :, None])[..., 0] + generators[:, :3, 3]  # (B, 6, 3)
-        rates = offset_rates(middle, velocities)
-        # To move the object is to move the camera's points in it the other way.
-        changes = -affines[:, None] @ generators
-        if intrinsics:
-            by_rays = _ray_generators(camera).to(index_from_camera.device, non_blocking=True)
-            changes = torch.cat([changes, affines[:, None] @ by_rays], 1)
-            rates = torch.nn.functional.pad(rates, (0, 4))
-    numbers = affines, changes, rates, offsets_of(middle, step_mm)
-    affines, changes, rates, offsets = (n.to(volume.data.device, non_blocking=True) for n in numbers)
+    poses = camera_from_volume.detach().to("cpu", torch.float64).numpy()
+    affines, middles = _numbers_of(volume, poses, step_mm)
+    generators = _twist_generators(centre.detach().to("cpu", torch.float64).numpy())
+    velocities = (generators[:, :3, :3] @ middles[:, None, :, None])[..., 0] + generators[:, :3, 3]  # (B, 6, 3)
+    distances = np.linalg.norm(middles, axis=-1)
+    rates = (velocities @ middles[..., None])[..., 0] / np.maximum(distances, _NO_DISTANCE)[:, None]
+    # To move the object is to move the camera's points in it the other way.
+    changes = -affines[:, None] @ generators
+    if intrinsics:
+        changes = np.concatenate([changes, affines[:, None] @ _ray_generators(camera)], 1)
+        rates = np.pad(rates, ((0, 0), (0, 4)))
+    offsets = distances % step_mm
     image, planes = _with_derivatives(volume, affines, changes, rates, camera, offsets, step_mm)
     if intrinsics:
         rays = unit_rays(camera, image.device)
         turned, stretched = planes[:, 6:9], planes[:, 9:]
-        generators = _ray_generators(camera)[:3, :3, :3].to(torch.float32).to(image.device, non_blocking=True)
-        shares = torch.einsum("hwi,nij,hwj->nhw", rays, generators, rays)
+        bent = torch.from_numpy(_ray_generators(camera)[:3, :3, :3]).float().to(image.device, non_blocking=True)
+        shares = torch.einsum("hwi,nij,hwj->nhw", rays, bent, rays)
         planes = torch.cat([planes[:, :6], turned - shares * stretched], 1)
     return image, planes.movedim(1, -1)
 
 
 def _with_derivatives(
-    volume: Volume, affines: Tensor, changes: Tensor, rates: Tensor, camera: Camera, offsets: Tensor, step_mm: float
+    volume: Volume, affines: Array, changes: Array, rates: Array, camera: Camera, offsets: Array, step_mm: float
 ) -> tuple[Tensor, Tensor]:
     """Images (B, H, W) and their derivatives (B, n, H, W) by parameters that change the affines by (B, n, 3, 4).
 
     Samples stay whole steps beyond `offsets` (B,) mm, which change by `rates` (B, n).
     """
     if volume.data.device.type == "cpu":
-        _check_inverse(affines.numpy())
-        numbers = affines.numpy(), camera, offsets.numpy(), step_mm
-        integrals, moments = cpu.projection_with_moments(bricked(volume), *numbers)
+        integrals, moments = cpu.projection_with_moments(bricked(volume), affines, camera, offsets, step_mm)
         slides = rates[:, :, None, None] * affines[:, None, :, :3]
-        planes = cpu.jacobian(moments, camera, changes.numpy(), slides.numpy())
-        return torch.from_numpy(integrals), torch.from_numpy(planes)
+        return torch.from_numpy(integrals), torch.from_numpy(cpu.jacobian(moments, camera, changes, slides))
     if reason := cuda.why_not(volume):
         raise InputError(f"project_with_jacobian: {reason}. Move the volume to the CPU, or use Triton on CUDA.")
-    image, derivatives = cuda.jacobian(volume, affines, changes, camera, offsets, step_mm)
-    along = -(derivatives[..., 3:6] * unit_rays(camera, image.device)).sum(-1, keepdim=True)
-    moved = derivatives + rates.to(torch.float32)[:, None, None] * along
-    return image, moved.movedim(-1, 1)
+    return cuda.jacobian(volume, affines, changes, rates, camera, offsets, step_mm)
 
 
-def _twist_generators(centre: Tensor) -> Tensor:
+def _twist_generators(centre: Array) -> Array:
     """Derivatives (6, 4, 4) at zero of the motion by a twist about `centre` (3,), for each entry of the twist."""
-    axes = torch.eye(3, dtype=centre.dtype, device=centre.device)
-    generators = centre.new_zeros(6, 4, 4)
-    generators[:3, :3, :3] = skew(axes)
-    generators[:3, :3, 3] = -skew(axes) @ centre
-    generators[3:, :3, 3] = axes
+    generators = np.zeros((6, 4, 4))
+    generators[:3, :3, :3] = _SPINS
+    generators[:3, :3, 3] = -_SPINS @ centre
+    generators[3:, :3, 3] = np.eye(3)
     return generators
 
 
-def _ray_generators(camera: Camera) -> Tensor:
-    """How the rays change with the intrinsics, and a stretch: (4, 4, 4) float64.
+def _ray_generators(camera: Camera) -> Array:
+    """How the rays change with the intrinsics, and a stretch: (4, 4, 4).
 
     The ray through a pixel runs along w = (x, y, f) with the source distance f. It changes by M w: M = e_z e_zᵀ with
     log f, and −e_x e_zᵀ / f and −e_y e_zᵀ / f with the principal point. Samples lie along the unit vector u = w / |w|,
     which changes by M u − (uᵀ M u) u; the last part is that of the stretch, M = 1.
     """
-    generators = torch.zeros(4, 4, 4, dtype=torch.float64)
+    generators = np.zeros((4, 4, 4))
     generators[0, 2, 2] = 1
     generators[1, 0, 2] = generators[2, 1, 2] = -1 / camera.sdd_mm
-    generators[3, :3, :3] = torch.eye(3)
+    generators[3, :3, :3] = np.eye(3)
     return generators
 
 
@@ -247,10 +240,14 @@ def _index_from_camera(volume: Volume, camera_from_volume: Tensor, step_mm: floa
 
 def _project_one(volume: Volume, camera_from_volume: Tensor, camera: Camera, step_mm: float) -> Tensor:
     on_cpu = volume.data.device.type == "cpu"
+    reason = None if on_cpu else cuda.why_not(volume)
     wanted = torch.is_grad_enabled() and (volume.data.requires_grad or camera_from_volume.requires_grad)
-    if on_cpu and not wanted and camera_from_volume.device.type == "cpu":
-        placed, first = _numbers_of(volume, camera_from_volume.detach().numpy(), step_mm)
-        return torch.from_numpy(cpu.projection(bricked(volume), placed, camera, first, step_mm))
+    if not wanted and reason is None and camera_from_volume.device.type == "cpu":
+        placed, middles = _numbers_of(volume, camera_from_volume.detach().numpy(), step_mm)
+        first = np.linalg.norm(middles, axis=-1) % step_mm
+        if on_cpu:
+            return torch.from_numpy(cpu.projection(bricked(volume), placed, camera, first, step_mm))
+        return cuda.project(volume, torch.from_numpy(placed), camera, torch.from_numpy(first), step_mm)
     index_from_camera = _index_from_camera(volume, camera_from_volume, step_mm)
     index_from_camera = index_from_camera.to(volume.data.device, non_blocking=True)
     offsets = offsets_of(middle_of(volume, camera_from_volume), step_mm).to(volume.data.device, non_blocking=True)
@@ -259,14 +256,14 @@ def _project_one(volume: Volume, camera_from_volume: Tensor, camera: Camera, ste
         _check_inverse(affines.detach().numpy())
         image: Tensor = _CpuProjection.apply(volume.data, affines, offsets, volume, camera, step_mm)
         return image
-    if reason := cuda.why_not(volume):
+    if reason is not None:
         _warn_of_the_march(reason)
         return march(volume.data, index_from_camera.to(torch.float32), camera, offsets, step_mm)
     return cuda.project(volume, affines, camera, offsets, step_mm)
 
 
 def _numbers_of(volume: Volume, poses: Array, step_mm: float) -> tuple[Array, Array]:
-    """Index from camera (B, 3, 4) and offsets (B,) mm for poses (B, 4, 4), where no gradient is asked for.
+    """Index from camera (B, 3, 4) and middles (B, 3) mm in the camera for poses (B, 4, 4), without their gradients.
 
     In numpy, because torch's calls take longer, by a twentieth of the time of a small image.
     """
@@ -278,7 +275,7 @@ def _numbers_of(volume: Volume, poses: Array, step_mm: float) -> tuple[Array, Ar
     except np.linalg.LinAlgError as error:
         raise InputError("project: a pose has no inverse. Give rigid poses in mm.") from error
     _check_inverse(affines)
-    return affines, np.linalg.norm(middles, axis=-1) % step_mm
+    return affines, middles
 
 
 @functools.cache

@@ -34,8 +34,3 @@ def offsets_of(middle: Tensor, step_mm: float) -> Tensor:
     So far, and so many whole steps, is it to the middle.
     """
     return middle.norm(dim=-1).remainder(step_mm)
-
-
-def offset_rates(middle: Tensor, velocities: Tensor) -> Tensor:
-    """Rates (B, n) in mm of the offsets where the middle (B, 3) mm moves with velocities (B, n, 3)."""
-    return (velocities @ torch.nn.functional.normalize(middle, dim=-1)[:, :, None])[..., 0]

@@ -212,8 +212,10 @@ def _moments(volume, leap, affines, geometry, offsets, x, y, z, on, depth, heigh
 
 
 # Kernels: tiles × poses ----------------------------------------------------------------------------------------------
-# Compiled once for all sizes: that a size is 1 or a multiple of 16, which Triton would compile for anew, helps nothing.
-_kernel = triton.jit(do_not_specialize=["depth", "height", "width", "rows", "columns", "dofs"])
+# Compiled once for all sizes: that a size is 1 or a multiple of 16, or numbers begin at such a place, for which Triton
+# would compile anew, helps nothing.
+_SIZES = ["depth", "height", "width", "rows", "columns", "dofs"]
+_kernel = triton.jit(do_not_specialize=[*_SIZES, "affines", "geometry", "offsets", "changes", "rates"])
 
 
 @_kernel
@@ -283,23 +285,31 @@ def jacobian(
     rows,
     columns,
     changes,
+    rates,
     dofs,
     image,
     out,
     tile: tl.constexpr,
 ):
-    """Line integrals `image` (B, H, W), and their derivatives `out` (B, H, W, dofs) along `changes` (B, dofs, 3, 4)."""
+    """Line integrals `image` (B, H, W), and their derivatives `out` (B, dofs, H, W) along `changes` (B, dofs, 3, 4).
+
+    The offsets change by `rates` (B, dofs).
+    """
     row, column, on, place = _pixels(rows, columns, tile)
     x, y, z = _unit_rays(geometry, row, column)
     value, sx, sy, sz, tx, ty, tz = _moments(
         volume, leap, affines, geometry, offsets, x, y, z, on, depth, height, width
     )
     tl.store(image + place, value.to(tl.float32), mask=on)
+    pose = tl.program_id(1)
+    along = _along(affines, pose, 0, sx, x, y, z) + _along(affines, pose, 1, sy, x, y, z)
+    along += _along(affines, pose, 2, sz, x, y, z)
     for dof in range(dofs):
-        change = changes + (tl.program_id(1) * dofs + dof) * 12
+        plane = pose.to(tl.int64) * dofs + dof
+        change = changes + plane * 12
         slope = _change(change, 0, sx, tx, x, y, z) + _change(change, 1, sy, ty, x, y, z)
-        slope += _change(change, 2, sz, tz, x, y, z)
-        tl.store(out + place * dofs + dof, slope.to(tl.float32), mask=on)
+        slope += _change(change, 2, sz, tz, x, y, z) + tl.load(rates + plane) * along
+        tl.store(out + plane * rows * columns + row * columns + column, slope.to(tl.float32), mask=on)
 
 
 @_kernel

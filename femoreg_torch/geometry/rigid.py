@@ -141,11 +141,15 @@ def about_point(transform: Tensor, centre: Tensor) -> Tensor:
 
 
 def twist_rates(changes: Tensor, pose: Tensor, centre: Tensor) -> Tensor:
-    """Twists (6, n) about `centre` (3,), mm in the camera frame, that belong to changes (n, 4, 4) of a pose (4, 4)."""
-    velocity = changes @ invert_rigid(pose)  # (n, 4, 4): of points in the camera frame
-    spin = velocity[:, :3, :3]
-    rotation = torch.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]])
-    return torch.cat([rotation, (spin @ centre + velocity[:, :3, 3]).T])
+    """Twists (..., 6, n) about `centre` (..., 3) that belong to changes (..., n, 4, 4) of poses (..., 4, 4).
+
+    The centre is in mm in the camera frame.
+    """
+    velocity = changes @ invert_rigid(pose)[..., None, :, :]  # (..., n, 4, 4): of points in the camera frame
+    spin = velocity[..., :3, :3]
+    rotation = torch.stack([spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]], -2)
+    shift = (spin @ centre[..., None, :, None])[..., 0] + velocity[..., :3, 3]
+    return torch.cat([rotation, shift.mT], -2)
 
 
 def rotation_angle(rotation: Tensor) -> Tensor:

@@ -24,7 +24,7 @@ from femoreg_torch.registration.imaging import (
 )
 from femoreg_torch.registration.intrinsics import PRIOR_WEIGHT, Intrinsics
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.scene import Body, Kind, Moving, RigidObject, Scene, split
+from femoreg_torch.registration.scene import Body, Kind, Moving, RigidObject, Scene, motions, split
 from femoreg_torch.registration.weights import Weighting, believed, pixel_weights
 from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import FixedSimilarity, Similarity, similarity_quadratics
@@ -227,7 +227,9 @@ class ImageCosts:
     def _motions(self, deltas: Tensor) -> list[tuple[Body, Tensor]]:
         """The rigid bodies with their motions (P, 4, 4)."""
         parts = zip(self.bodies, split(deltas, self.bodies), strict=True)
-        return [(body, body.motion(part)) for body, part in parts if isinstance(body, Body)]
+        rigid = [(body, part) for body, part in parts if isinstance(body, Body)]
+        bodies = [body for body, _ in rigid]
+        return list(zip(bodies, motions(bodies, [part for _, part in rigid]), strict=True))
 
     def _placed(
         self, target: _Target, deltas: Tensor, motions: Sequence[tuple[Body, Tensor]], names: Sequence[str]
@@ -250,11 +252,9 @@ class ImageCosts:
         every = self._placed(target, around, motions, target.moving).movedim(1, 0)  # (O, 1 + 2 n, 4, 4)
         # Derivatives (O, n, 4, 4) of the poses by the bodies' motions, by central differences, good to some 1e-9.
         rates = (every[:, 1 : n + 1] - every[:, n + 1 :]) / (2 * _STEP)
-        points = [self.objects[name].reference_point for name in target.moving]
-        twists = [
-            twist_rates(change, pose, transform_points(pose, point[None])[0])
-            for point, pose, change in zip(points, every[:, 0], rates, strict=True)
-        ]
+        points = torch.stack([self.objects[name].reference_point for name in target.moving])
+        centres = transform_points(every[:, 0], points[:, None])[:, 0]
+        twists = [twist_rates(rates, every[:, 0], centres).flatten(0, 1)]
         for intrinsics, chosen in self._intrinsics(torch.eye(n, dtype=torch.float64)):
             twists.append(intrinsics.by_delta(target.view) @ chosen.T)
         return every[:, 0], torch.cat(twists)

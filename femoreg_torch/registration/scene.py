@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -231,16 +232,28 @@ class Body:
     centre: Tensor
     scale: Tensor
 
-    @property
+    @cached_property
     def free(self) -> Tensor:
         """Indices (n,) of the degrees of freedom that move."""
         return self.scale.nonzero()[:, 0]
 
-    def motion(self, delta: Tensor) -> Tensor:
-        """Rigid motions (P, 4, 4) in the body's camera for deltas (P, n) in units of `scale`."""
+    def twist(self, delta: Tensor) -> Tensor:
+        """Twists (P, 6) in rad and mm of deltas (P, n) in units of `scale`."""
         twist = delta.new_zeros(len(delta), 6)
         twist[:, self.free] = delta * self.scale[self.free]
-        return about_point(exp_se3(twist), self.centre)
+        return twist
+
+    def motion(self, delta: Tensor) -> Tensor:
+        """Rigid motions (P, 4, 4) in the body's camera for deltas (P, n) in units of `scale`."""
+        return about_point(exp_se3(self.twist(delta)), self.centre)
+
+
+def motions(bodies: Sequence[Body], deltas: Sequence[Tensor]) -> list[Tensor]:
+    """As `Body.motion` of several bodies, each with its deltas (P, n_b), at once: (P, 4, 4) each."""
+    if not bodies:
+        return []
+    twists = torch.stack([body.twist(delta) for body, delta in zip(bodies, deltas, strict=True)])
+    return list(about_point(exp_se3(twists), torch.stack([body.centre for body in bodies])[:, None]))
 
 
 def reference_point_in_view(scene: Scene, poses: Poses, name: str, view: int) -> Tensor:

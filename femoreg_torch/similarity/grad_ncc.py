@@ -1,6 +1,7 @@
 """Patch-wise normalised cross-correlation of image gradients, the similarity of the paper."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -8,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from femoreg_torch.settings import check_within
-from femoreg_torch.similarity import cpu
+from femoreg_torch.similarity import cpu, cuda
 from femoreg_torch.similarity.checks import check_patches, check_size, check_weights, check_whole
 from femoreg_torch.similarity.curvature import patch_curvature
 from femoreg_torch.similarity.kernels import (
@@ -83,9 +84,21 @@ class FixedGradNcc:
         check_size(images, self.fixed)
         if images.device.type == "cpu" and images.dtype == torch.float32:
             value: Tensor = _CpuGradNcc.apply(images, self)
+        elif cuda.runs(images):
+            value = _CudaGradNcc.apply(images, self)
         else:
             value = self._reference(images)
         return 1 - value
+
+    @cached_property
+    def tap_tables(self) -> Tensor:
+        """`taps` (2, 3, K) float32 where the images are: inside, at the first and at the last row or column.
+
+        At an edge the image goes on as it ends there. So a pixel of the edge counts for all that lie beyond it as well:
+        its tap is the sum of theirs.
+        """
+        taps = torch.stack(self.taps)
+        return torch.stack([taps, taps.cumsum(1), taps.flip(1).cumsum(1).flip(1)], 1).float()
 
     def quadratic(self, image: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost (), scores (T, n), Gauss–Newton hessian (n, n), see `SmoothFixedSimilarity`; the gradient is exact."""
@@ -100,6 +113,10 @@ class FixedGradNcc:
             check_size(image[None], self.fixed)
             value, slope = cpu.grad_ncc_and_gradient(image.contiguous().numpy(), *_CpuGradNcc._arguments(self))
             return torch.tensor(1 - value, dtype=torch.float64), -torch.from_numpy(slope)[None]
+        if cuda.runs(image):
+            check_size(image[None], self.fixed)
+            values, slopes = cuda.grad_ncc_and_gradient(image[None], self)
+            return 1 - values[0], -slopes
         moving = image[None].clone().requires_grad_()
         cost = self(moving)[0]
         (derivative,) = torch.autograd.grad(cost, moving)
@@ -114,6 +131,8 @@ class FixedGradNcc:
             of_pixels, of_means, along = (torch.from_numpy(factor).flatten(1) for factor in factors)
             both = of_pixels @ of_pixels.T - of_means @ of_means.T - along @ along.T
             return both.to(torch.float64) / 2  # the cost is the mean over both derivatives
+        if cuda.runs(image) and cuda.runs(changes):
+            return cuda.curvature(image, changes, self, stride)
         maps = image_gradients(torch.cat([image[None], changes]), self.taps)  # (1 + n, 2, H, W)
         along_columns, along_rows = (
             patch_curvature(maps[0, d], maps[1:, d], self.fixed[d], self.scale[d], self.weights, self.radius, stride)
@@ -157,3 +176,21 @@ class _CpuGradNcc(torch.autograd.Function):
         arguments = _CpuGradNcc._arguments(ctx.similarity)
         gradient = cpu.grad_ncc_gradient(images.detach().contiguous().numpy(), *arguments, upstream.double().numpy())
         return torch.from_numpy(gradient), None
+
+
+class _CudaGradNcc(torch.autograd.Function):
+    """The weighted mean NCC (B,) of images (B, H, W) by Triton."""
+
+    @staticmethod
+    def forward(ctx: Any, images: Tensor, similarity: FixedGradNcc) -> Tensor:
+        if not ctx.needs_input_grad[0]:
+            return cuda.grad_ncc(images, similarity)
+        values, gradient = cuda.grad_ncc_and_gradient(images, similarity)
+        ctx.save_for_backward(gradient)
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        return upstream.to(gradient)[:, None, None] * gradient, None

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
-from femoreg_torch.similarity import cpu
+from femoreg_torch.similarity import cpu, cuda
 from femoreg_torch.similarity.interface import FixedSimilarity, SmoothFixedSimilarity
 from femoreg_torch.similarity.watched import gave_nan, similarity_name, watched
 
@@ -117,6 +117,8 @@ def tile_scores(changes: Tensor, slope: Tensor, tile: int) -> Tensor:
     """The gradient by square tiles, (T, n) float64: of an image that changes by (n, H, W) and slopes by (1, H, W)."""
     if changes.device.type == "cpu" and changes.dtype == slope.dtype == torch.float32:
         return torch.from_numpy(cpu.tile_sums(changes.contiguous().numpy(), slope[0].contiguous().numpy(), tile)).T
+    if cuda.runs(changes) and cuda.runs(slope):
+        return cuda.tile_sums(changes, slope[0], tile).T
     return (
         F.avg_pool2d(changes[:, None] * slope, tile, ceil_mode=True, divisor_override=1).flatten(1).T.to(torch.float64)
     )

@@ -11,7 +11,7 @@ import torch
 from drr_scenes import DEVIATING_CAMERA, centred, float64, random_poses, relative_error, smooth, sparse
 from torch import Tensor
 
-from femoreg_torch.drr import cuda, project, project_with_jacobian
+from femoreg_torch.drr import cuda, device_bricks, project, project_with_jacobian
 from femoreg_torch.drr.bricks import bricked
 from femoreg_torch.drr.device_bricks import bricked_on_device
 from femoreg_torch.errors import InputError
@@ -44,7 +44,7 @@ def test_kernels_compile_for_a_gpu(kernel):
     from femoreg_torch.drr import triton_kernels
 
     function = getattr(triton_kernels, kernel)
-    pointers = dict.fromkeys(("affines", "geometry", "offsets", "parts", "changes"), "*fp64")
+    pointers = dict.fromkeys(("affines", "geometry", "offsets", "parts", "changes", "rates"), "*fp64")
     pointers |= dict.fromkeys(("image", "upstream", "out", "gradient"), "*fp32")
     pointers |= {"volume": "*fp16", "leap": "*u8", "tile": "constexpr"}
     signature = {name: pointers.get(name, "i32") for name in function.arg_names}
@@ -81,7 +81,7 @@ def test_data_made_under_inference_mode_are_refused():
 
 def test_an_empty_volume_is_leapt_over_from_wherever_a_ray_enters():
     leap = bricked_on_device(centred(torch.zeros(20, 30, 40))).leap
-    assert (leap >= max(leap.shape)).all()
+    assert (leap >= min(max(leap.shape), device_bricks._FARTHEST)).all()
 
 
 def test_why_not_names_the_reason(monkeypatch):
@@ -115,7 +115,7 @@ def test_cuda_agrees_with_the_cpu_on_images_and_gradients():
     weights = torch.randn(4, *camera.shape, generator=torch.Generator().manual_seed(1))
     results = []
     for move, device in ((lambda volume: volume, "cpu"), (on_cuda, "cuda")):
-        moving = poses.to(device).requires_grad_()
+        moving = poses.to(device, copy=True).requires_grad_()
         moved = [move(volume) for volume in volumes]
         moved = [volume.with_data(volume.data.clone().requires_grad_()) for volume in moved]
         image = project(moved, moving, camera)
@@ -132,7 +132,7 @@ def test_cuda_agrees_with_the_cpu_on_the_jacobian_image():
     expected = project_with_jacobian(volumes[1], poses[:, 1], camera, centre)
     found = project_with_jacobian(on_cuda(volumes[1]), poses[:, 1].cuda(), camera, centre.cuda())
     for ours, theirs in zip(found, expected, strict=True):
-        assert relative_error(ours.cpu().flatten(0, 2).T, theirs.double().flatten(0, 2).T) < 1e-4
+        assert relative_error(ours.cpu().flatten(0, 2).T, theirs.double().flatten(0, 2).T) < 3e-4
 
 
 @on_gpu
@@ -161,12 +161,12 @@ def test_cuda_pose_gradients_agree_bit_for_bit():
 def test_cuda_never_waits_for_the_device():
     volumes, poses, camera = scene()
     moved, moving = [on_cuda(volume) for volume in volumes], poses.cuda().requires_grad_()
-    centre = float64(0, 0, 600).cuda()
     weights = torch.rand(4, *camera.shape, device="cuda")
     torch.cuda.set_sync_debug_mode("error")
     try:
         project(moved, moving, camera).backward(weights)
-        project_with_jacobian(moved[0], moving[:, 0], camera, centre)
+        project(moved, poses, camera)
+        project_with_jacobian(moved[0], poses[:, 0], camera, float64(0, 0, 600))
     finally:
         torch.cuda.set_sync_debug_mode("default")
 

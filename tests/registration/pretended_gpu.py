@@ -11,8 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.overrides import TorchFunctionMode
@@ -20,7 +22,12 @@ from torch.utils._pytree import tree_leaves
 
 from femoreg_torch.drr import cuda, operator
 from femoreg_torch.geometry import Camera
+from femoreg_torch.similarity import cuda as similarity_cuda
+from femoreg_torch.similarity.grad_ncc import FixedGradNcc
+from femoreg_torch.similarity.quadratic import tile_scores
 from femoreg_torch.volume import Volume
+
+Array = NDArray[np.float64]
 
 # What looks at values, or at how many there are, and so waits until they are computed.
 _WAITING = {
@@ -141,35 +148,62 @@ def _masked(index: Any) -> bool:
 def pretended_gpu(monkeypatch: pytest.MonkeyPatch, interpreted: bool = False) -> Iterator[PretendedGpu]:
     """A machine with a GPU whose kernels are the CPU's, or, `interpreted`, go through Triton's interpreter."""
     gpu = PretendedGpu()
-    launch = cuda._launch
 
-    def interpret(*arguments: Any) -> None:
-        with torch._C.DisableTorchFunction():
-            launch(*arguments)
+    def through_the_interpreter(launch: Any) -> Any:
+        def interpret(*arguments: Any, **constants: Any) -> None:
+            with torch._C.DisableTorchFunction():
+                launch(*arguments, **constants)
+
+        return interpret
+
+    def on_the_cpu(compiled: Any) -> Any:
+        """A function of tensors on the device, done by one of the CPU."""
+
+        def stand_in(*arguments: Any) -> Any:
+            tensors = [leaf for leaf in tree_leaves(arguments) if isinstance(leaf, Tensor)]
+            assert all(gpu.holds(tensor) for tensor in tensors)
+            with torch._C.DisableTorchFunction():
+                return gpu.take(compiled(*arguments))
+
+        return stand_in
 
     def project(volume: Volume, affines: Tensor, camera: Camera, offsets: Tensor, step_mm: float) -> Tensor:
         assert gpu.holds(volume.data)
-        assert gpu.holds(affines)
-        assert gpu.holds(offsets)
+        assert gpu.holds(affines) == gpu.holds(offsets)
         with torch._C.DisableTorchFunction():
             image = operator._CpuProjection.apply(volume.data, affines, offsets, volume, camera, step_mm)
         return gpu.take(image)
 
     def jacobian(
-        volume: Volume, affines: Tensor, changes: Tensor, camera: Camera, offsets: Tensor, step_mm: float
+        volume: Volume, affines: Array, changes: Array, rates: Array, camera: Camera, offsets: Array, step_mm: float
     ) -> tuple[Tensor, Tensor]:
-        assert all(gpu.holds(tensor) for tensor in (volume.data, affines, changes, offsets))
+        assert gpu.holds(volume.data)
         with torch._C.DisableTorchFunction():
-            still = offsets.new_zeros(len(affines), changes.shape[1])
-            image, planes = operator._with_derivatives(volume, affines, changes, still, camera, offsets, step_mm)
-        return gpu.take((image, planes.movedim(1, -1)))
+            found = operator._with_derivatives(volume, affines, changes, rates, camera, offsets, step_mm)
+        return gpu.take(found)
+
+    def grad_ncc(images: Tensor, similarity: FixedGradNcc) -> Tensor:
+        return 1 - similarity(images)
+
+    def grad_ncc_and_gradient(images: Tensor, similarity: FixedGradNcc) -> tuple[Tensor, Tensor]:
+        costs, slopes = zip(*(similarity._with_slope(image) for image in images), strict=True)
+        return 1 - torch.stack(costs), -torch.cat(slopes)
+
+    def curvature(image: Tensor, changes: Tensor, similarity: FixedGradNcc, stride: int) -> Tensor:
+        return similarity.curvature(image, changes, stride)
+
+    def tile_sums(changes: Tensor, slope: Tensor, tile: int) -> Tensor:
+        return tile_scores(changes, slope[None], tile).T
 
     monkeypatch.setattr(cuda, "why_no_kernels", lambda device: None)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     if interpreted:
-        monkeypatch.setattr(cuda, "_launch", interpret)
+        for module in (cuda, similarity_cuda):
+            monkeypatch.setattr(module, "_launch", through_the_interpreter(module._launch))
     else:
         monkeypatch.setattr(cuda, "project", project)
         monkeypatch.setattr(cuda, "jacobian", jacobian)
+        for stand_in in (grad_ncc, grad_ncc_and_gradient, curvature, tile_sums):
+            monkeypatch.setattr(similarity_cuda, stand_in.__name__, on_the_cpu(stand_in))
     with gpu:
         yield gpu

