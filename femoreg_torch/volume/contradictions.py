@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from scipy import fft
 from torch import Tensor
-from torch.nn import functional as F
 
 from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.labels import label_box
@@ -108,12 +107,14 @@ def _quantile(values: Tensor, share: float) -> float:
 
 def _grown(mask: Tensor, by: int) -> Tensor:
     """A mask (D, H, W), bool, grown by some voxels along all axes."""
-    grown = mask.float()[None, None]
+    grown = mask.clone()
     for axis in range(3):
-        size, padding = [1, 1, 1], [0, 0, 0]
-        size[axis], padding[axis] = 2 * by + 1, by
-        grown = F.max_pool3d(grown, size, 1, padding)
-    return grown[0, 0] > 0
+        before = grown.clone()
+        for shift in range(1, min(by, mask.shape[axis] - 1) + 1):
+            left = mask.shape[axis] - shift
+            grown.narrow(axis, shift, left).logical_or_(before.narrow(axis, 0, left))
+            grown.narrow(axis, 0, left).logical_or_(before.narrow(axis, shift, left))
+    return grown
 
 
 def _correlation(image: np.ndarray, kernel: np.ndarray, reach: Sequence[int]) -> np.ndarray:
