@@ -5,7 +5,7 @@ All take the same volume, camera and `camera_from_volume`, and are differentiabl
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -36,7 +36,7 @@ def chords(volume: Volume, camera: Camera, camera_from_volume: Tensor) -> tuple[
 def femoreg(volume: Volume, camera: Camera, device: str, step_mm: float) -> tuple[str, Render]:
     """This project."""
     posed = Volume(volume.data.to(device), volume.lps_from_index)
-    return "FemoReg Torch", lambda poses: project([posed], poses[:, None].to(device), camera, step_mm)
+    return "FemoReg Torch", lambda poses: project([posed], poses[:, None], camera, step_mm)
 
 
 def nanodrr(volume: Volume, camera: Camera, device: str, step_mm: float | None) -> tuple[str, Render]:
@@ -59,8 +59,9 @@ def nanodrr(volume: Volume, camera: Camera, device: str, step_mm: float | None) 
     matrix[:2, 2] += 0.5  # its pixel centres lie at + 0.5
     inverse = torch.linalg.inv(matrix).float().to(device)
 
-    def samples(pose: Tensor) -> int:
-        enter, leave = chords(volume, camera, pose)
+    @cache  # once for each pose, so that it does not count
+    def samples(pose: tuple[float, ...]) -> int:
+        enter, leave = chords(volume, camera, torch.tensor(pose, dtype=torch.float64).view(4, 4))
         return max(2, round((leave - enter).mean().item() / step_mm)) if step_mm else 500
 
     def image(poses: Tensor) -> Tensor:
@@ -68,7 +69,7 @@ def nanodrr(volume: Volume, camera: Camera, device: str, step_mm: float | None) 
         volume_from_camera = torch.linalg.inv(poses.double()).float().to(device)
         sdd = torch.full((count,), camera.sdd_mm, device=device)
         intrinsics = inverse.expand(count, -1, -1)
-        n = samples(poses[0].detach().cpu().double())
+        n = samples(tuple(poses[0].detach().flatten().tolist()))
         return render(subject, intrinsics, volume_from_camera, sdd, *camera.shape, n_samples=n)[:, 0]
 
     return f"nanodrr, {f'{step_mm:g} mm steps' if step_mm else 'its default of 500 samples'}", image

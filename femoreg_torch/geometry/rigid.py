@@ -14,6 +14,9 @@ from femoreg_torch.errors import InputError, in_mm
 
 _SMALL = 1e-2  # rad; below it the series beat the closed forms even in float32
 
+_EXACT = 1e-9  # of a rotation times its transposed: nothing was cut off
+_ROUNDED = 2e-4  # the same of one with four decimals: 2 · √3 · 0.00005, and some
+
 FARTHEST_MM = 1e5  # of anything in an operating theatre
 
 
@@ -165,8 +168,12 @@ def pose_difference(first: Tensor, second: Tensor, point: Tensor) -> tuple[float
     return float(turned), float(shift.norm())
 
 
-def check_rigid(transform: Tensor, where: str, tolerance: float = 1e-4) -> Tensor:
-    """`transform` itself if it is a 4×4 rigid transform without reflection, else an `InputError` that names `where`."""
+def check_rigid(transform: Tensor, where: str) -> Tensor:
+    """A 4×4 rigid transform without reflection, as a file has it: the nearest one, where digits were cut off.
+
+    Four decimals are enough: they turn by 0.006°, which is 0.1 mm at the end of a metre. Raises an `InputError` that
+    names `where` for what is no such transform.
+    """
     if transform.shape != (4, 4):
         raise InputError(f"{where}: a 4×4 matrix was expected, this one is {tuple(transform.shape)}.")
     if not torch.isfinite(transform).all():
@@ -178,14 +185,18 @@ def check_rigid(transform: Tensor, where: str, tolerance: float = 1e-4) -> Tenso
     rotation = transform[:3, :3]
     bottom = transform.new_tensor([0.0, 0.0, 0.0, 1.0])
     gap = (rotation @ rotation.T - torch.eye(3, dtype=rotation.dtype)).abs().max().item()
-    if (transform[3] - bottom).abs().max() > tolerance or gap > tolerance:
+    if (transform[3] - bottom).abs().max() > _ROUNDED or gap > _ROUNDED:
         raise InputError(
             f"{where}: not a rigid transform (its rotation is off orthonormal by {gap:.2g}, its last row is "
-            f"{[round(v, 4) for v in transform[3].tolist()]}). Remove scaling and shear."
+            f"{[round(v, 4) for v in transform[3].tolist()]}). Remove scaling and shear, and write four decimals at "
+            "least."
         )
     if torch.linalg.det(rotation) < 0:
         raise InputError(f"{where}: a mirrored (left-handed) transform, determinant −1. Check for RAS/LPS mix-ups.")
-    return transform
+    if gap < _EXACT and torch.equal(transform[3], bottom):
+        return transform
+    u, _, vh = torch.linalg.svd(rotation)
+    return rigid(u @ vh, transform[:3, 3])
 
 
 def euler_xyz_deg(rotation: Tensor) -> Tensor:

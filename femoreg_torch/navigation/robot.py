@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError, in_mm, shortened
-from femoreg_torch.geometry import check_rigid, read_itk_transform, rigid
+from femoreg_torch.geometry import check_rigid, read_itk_transform
 from femoreg_torch.text import MOST_YAML_BYTES, read_bytes
 
 _LEAST_REACH_MM = 10.0  # no tool or flange stands this close to the base of its robot: the numbers are metres
@@ -60,7 +60,7 @@ def read_robot(path: Path, tool: str) -> Robot:
     if set(found) not in (names.direct, names.by_flange):
         there = ", ".join(f"`{name}`" for name in found) or "no matrix"
         raise InputError(f"{path}: holds {there}. Expected: {names.format}.")
-    poses = {name: _exactly_rigid(check_rigid(matrix, f"{path}, {name}")) for name, matrix in found.items()}
+    poses = {name: check_rigid(matrix, f"{path}, {name}") for name, matrix in found.items()}
     base_from_flange = poses.get("base_from_flange")
     if base_from_flange is None:
         base_from_tool = poses[f"base_from_{tool}"]
@@ -81,12 +81,6 @@ def _in_metres(path: Path, what: str, distance: float, place: str, way_out: str 
         f"{path}: the {what} would stand {in_mm(distance)} from {place}. Are the translations in metres? Write them in "
         f"mm.{way_out}"
     )
-
-
-def _exactly_rigid(pose: Tensor) -> Tensor:
-    """The nearest rotation in place of one with few digits: an arm of a metre turns 0.0001 into 0.1 mm."""
-    u, _, vh = torch.linalg.svd(pose[:3, :3])
-    return rigid(u @ vh, pose[:3, 3])
 
 
 def _read_text(path: Path, names: _Names) -> dict[str, Tensor]:

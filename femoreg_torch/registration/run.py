@@ -92,8 +92,9 @@ def register(
                 f"camera_from_camera1: ({len(case.views)}, 4, 4) was expected for the case's views, got "
                 f"{tuple(cameras.shape)}."
             )
-        for number, pose in enumerate(cameras):
-            check_rigid(pose, f"camera_from_camera1[{number}]")
+        cameras = torch.stack(
+            [check_rigid(pose, f"camera_from_camera1[{number}]") for number, pose in enumerate(cameras)]
+        )
         if not torch.allclose(cameras[0], torch.eye(4, dtype=torch.float64), atol=1e-6):
             raise InputError(
                 "camera_from_camera1[0]: the identity was expected, as camera 1 is the frame of all poses. Give "

@@ -177,6 +177,15 @@ def test_inverse_undoes_on_both_sides(b_from_a):
     assert check_rigid(b_from_a, "here") is b_from_a
 
 
+@given(transforms)
+def test_a_transform_with_few_digits_is_made_rigid(b_from_a):
+    turned = b_from_a[:3, :3]
+    written = rigid((turned * 1e4).round() / 1e4, b_from_a[:3, 3])
+    found = check_rigid(written, "here")
+    assert_close(found, b_from_a, atol=1e-4, rtol=0)
+    assert_close(found[:3, :3] @ found[:3, :3].T, torch.eye(3, dtype=torch.float64), atol=1e-12, rtol=0)
+
+
 @given(transforms, vectors)
 def test_about_point_is_a_change_of_origin(transform, centre):
     there, back = rigid(translation=100 * centre), rigid(translation=-100 * centre)
