@@ -97,7 +97,7 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str | None = None, se
     Args:
         ct: CT in HU: folder of a DICOM series, or a NIfTI, NRRD or MHA file.
         labels: Segmentation of hip bones and femora, as `femoreg new-case` takes it.
-        out: File to write (.mrk.json or .json).
+        out: File to write (.mrk.json or .json); one that is there already stays.
         bones: Label table of the map (totalsegmentator_v2, …, or a YAML file). By default the names of its parts say
             it, or else it is of `femoreg segment`.
         series: Which of several DICOM series: its number, UID, or a part of its description.
@@ -113,6 +113,8 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str | None = None, se
 
     if not out.name.lower().endswith(".json"):
         raise InputError(f"{out}: the name is to end in .mrk.json or .json.")
+    if out.exists():
+        raise InputError(f"{out}: is there already, and may be corrected by hand. Choose another name, or remove it.")
     console = Console(soft_wrap=True)
     volume, told = read_ct_told(ct, series)
     table, parts = table_of_map(labels, bones, usual="femoreg")

@@ -491,7 +491,12 @@ def test_landmarks_go_by_the_names_of_the_parts_whatever_their_values(
     exchanged.SetMetaData("Segment0_Name", "Knochen 1")
     exchanged.SetMetaData("Segment1_Name", "Knochen 2")
     sitk.WriteImage(exchanged, str(tmp_path / "mine.seg.nrrd"))
-    assert main(["landmarks", str(files / "ct.nii.gz"), str(tmp_path / "mine.seg.nrrd"), "--out", str(out)]) == 2
+    assert (
+        main(
+            ["landmarks", str(files / "ct.nii.gz"), str(tmp_path / "mine.seg.nrrd"), "--out", str(tmp_path / "p.json")]
+        )
+        == 2
+    )
     told = capsys.readouterr().err
     assert "none of its parts is named after a hip bone; those taken for no bone are: Knochen 1, Knochen 2" in told
 

@@ -42,8 +42,13 @@ def test_a_head_that_no_adult_has_is_a_warning(
     assert any(words in warning for warning in told["warnings"]) == doubted
     assert (words in capsys.readouterr().out) == doubted
     ct_path, known = str(tmp_path / "ct.nii.gz"), str(tmp_path / "known.nii.gz")
-    assert main(["landmarks", ct_path, known, "--out", str(tmp_path / "points.json")]) == 0
+    points = tmp_path / "points.json"
+    assert main(["landmarks", ct_path, known, "--out", str(points)]) == 0
     assert (words in capsys.readouterr().out) == doubted
+    points.write_text("corrected by hand", encoding="utf-8")
+    assert main(["landmarks", ct_path, known, "--out", str(points)]) == 2
+    assert "points.json: is there already" in capsys.readouterr().err
+    assert points.read_text(encoding="utf-8") == "corrected by hand"
 
 
 def test_a_head_without_its_socket_is_not_looked_for() -> None:
