@@ -58,8 +58,10 @@ def touching_faces(owner: Tensor) -> Indices:
         a, b = owner.narrow(axis, 0, size - 1), owner.narrow(axis, 1, size - 1)
         touching = (a != b) & (a >= 0) & (b >= 0)
         found.append(torch.stack([a[touching], b[touching]], 1))
-    pairs, faces = np.unique(torch.cat(found).sort(1).values.numpy(), axis=0, return_counts=True)
-    return np.column_stack([pairs, faces])
+    count = int(owner.max()) + 1
+    low, high = torch.cat(found).sort(1).values.numpy().T
+    pairs, faces = np.unique(low * count + high, return_counts=True)  # far faster than unique rows
+    return np.column_stack([*np.divmod(pairs, count), faces])
 
 
 def mistakable(material: Indices, attenuation: Doubles, touching: Indices) -> tuple[Indices, Doubles]:

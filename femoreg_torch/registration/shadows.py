@@ -138,7 +138,7 @@ def views_of(
 
     there = [view for _, view in scene.there([device.kind], range(scene.views))]
     asked = [view for view in there if chosen_views is None or view in chosen_views]
-    return [view for view in on_all_cores(look, asked, scene.device) if view is not None]
+    return [view for view in on_all_cores(look, asked) if view is not None]
 
 
 def first_guess(seen: list[View], attenuation: Doubles) -> Doubles:
