@@ -6,6 +6,7 @@ model are stretched and compressed along the guide, and the images near the tip 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,8 +18,8 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, project_points, transform_points
 from femoreg_torch.optimize import parabola_minimum
 from femoreg_torch.registration.imaging import Imaging
-from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs
+from femoreg_torch.registration.level import Level, binning
+from femoreg_torch.registration.objective import ImageCosts, image_costs
 from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume
@@ -28,6 +29,7 @@ _SIMILARITY = GradNcc(patch_radius=3)
 _LONGEST_MM = 4  # by which the model is stretched or compressed, in steps of 1 mm
 _STRETCH_MM = 6.0, 14.0  # before the tip: where the model is stretched; nearer to the tip it keeps its shape
 _AROUND_MM = 12.0  # of the end of the guide: the box that is stretched, and, at the depth of the tip, what is looked at
+_MARGIN_PX = 8  # of the level, around what is looked at: what the patches and derivatives there need
 _LEAST_PIXELS = 200  # of an image, near the tip, for it to count
 
 
@@ -52,8 +54,8 @@ def tip_length(
     base, tip = (point.double() for point in guide)
     axis = (tip - base) / (tip - base).norm()
     near = _near_the_tip(scene, poses, name, kind, tip, axis)
-    images = [(kind, view) for view, mask in enumerate(near) if mask is not None and mask.sum() >= _LEAST_PIXELS]
-    if not images:
+    views = [view for view, mask in enumerate(near) if mask is not None and mask.sum() >= _LEAST_PIXELS]
+    if not views:
         return None
     thing = scene.objects[name]
     parted = _parted(thing.volume, tip, axis)
@@ -74,16 +76,21 @@ def tip_length(
         fields=scene.fields | {kind: tuple(near)},
     )
     still = Body((names[1],), 0, tip, torch.ones(6, dtype=torch.float64))
+
+    def costs_of(view: int) -> ImageCosts:
+        window, image = _around(scene, kind, view), [(kind, view)]
+        return image_costs(window, poses, (still,), [*shown, *names], image, _LEVEL, _SIMILARITY, imaging=imaging)
+
     try:
-        costs = image_costs(scene, poses, (still,), [*shown, *names], images, _LEVEL, _SIMILARITY, imaging=imaging)
+        costs = on_all_cores(costs_of, views, scene.device)
     except InputError:  # what is exposed leaves nothing to compare
         return None
     lengths = range(-_LONGEST_MM, _LONGEST_MM + 1)
-    drawn = costs.objects[names[1]].volume
+    stretched = _stretching(costs[0].objects[names[1]].volume, tip, axis)
 
     def cost(mm: float) -> float:
-        candidate = costs.with_object(names[1], replace(objects[1], volume=_stretched(drawn, tip, axis, mm)))
-        return float(candidate(candidate.still[None]).mean())
+        candidates = [of.with_object(names[1], replace(objects[1], volume=stretched(mm))) for of in costs]
+        return float(torch.cat([of(of.still[None]) for of in candidates]).mean())
 
     found = on_all_cores(cost, lengths, scene.device)
     best = min(max(min(range(len(found)), key=lambda n: found[n]), 1), len(found) - 2)
@@ -113,6 +120,26 @@ def _near_the_tip(scene: Scene, poses: Poses, name: str, kind: Kind, tip: Tensor
     return near
 
 
+def _around(scene: Scene, kind: Kind, view: int) -> Scene:
+    """The scene of one view with images of what is exposed of the image of a kind, and a little around."""
+    exposed = scene.field(kind, view)
+    assert exposed is not None  # what is near the tip
+    factor = binning(_LEVEL.pixel_mm, scene.carm.camera)
+    seen = [exposed.any(1 - axis).nonzero()[:, 0] for axis in range(2)]
+    first = [max(int(of[0]) // factor - _MARGIN_PX, 0) * factor for of in seen]
+    last = [(int(of[-1]) // factor + 1 + _MARGIN_PX) * factor for of in seen]
+    window = slice(first[0], last[0]), slice(first[1], last[1])
+
+    def cut(images: dict[Kind, tuple[Tensor | None, ...]]) -> dict[Kind, tuple[Tensor | None, ...]]:
+        return {
+            kind: tuple(one[window] if n == view and one is not None else None for n, one in enumerate(of))
+            for kind, of in images.items()
+        }
+
+    carm = replace(scene.carm, camera=scene.carm.camera.window(*window))
+    return replace(scene, carm=carm, images=cut(scene.images), fields=cut(scene.fields), saturated={})
+
+
 def _parted(volume: Volume, tip: Tensor, axis: Tensor) -> tuple[Volume, Volume] | None:
     """All but a box around the end of a guide; and that box, with room for the guide to grow, on a grid of its own.
 
@@ -135,8 +162,8 @@ def _parted(volume: Volume, tip: Tensor, axis: Tensor) -> tuple[Volume, Volume] 
     return volume.with_data(rest), Volume(F.pad(volume.data[z, y, x], around), affine)
 
 
-def _stretched(volume: Volume, tip: Tensor, axis: Tensor, mm: float) -> Volume:
-    """A volume whose end along an axis is stretched by so much; compressed where it is negative."""
+def _stretching(volume: Volume, tip: Tensor, axis: Tensor) -> Callable[[float], Volume]:
+    """A volume whose end along an axis is stretched by so many mm; compressed where they are negative."""
     data = volume.data
     size = torch.tensor(data.shape).flip(0)
     x, y, z = (torch.arange(n, dtype=torch.float64) for n in size.tolist())
@@ -144,8 +171,15 @@ def _stretched(volume: Volume, tip: Tensor, axis: Tensor, mm: float) -> Volume:
     height = z[:, None, None] * rates[2] + y[:, None] * rates[1] + x * rates[0]
     height += (volume.lps_from_index[:3, 3] - tip) @ axis
     near, far = _STRETCH_MM
-    moved = mm * ((height + far) / (far - near + mm)).clamp(0, 1)  # of what lands at that height
+    height = (height + far).to(data)
     along = torch.linalg.solve(volume.lps_from_index[:3, :3], axis)  # voxels per mm
-    planes = torch.meshgrid(z, y, x, indexing="ij")[::-1]
-    source = torch.stack([2 * (n - moved * a) / (m - 1) - 1 for n, a, m in zip(planes, along, size, strict=True)], -1)
-    return volume.with_data(F.grid_sample(data[None, None], source[None].to(data), align_corners=True)[0, 0])
+    shift = (2 * along / (size - 1)).to(data)
+    places = torch.meshgrid(*(2 * n / (len(n) - 1) - 1 for n in (z, y, x)), indexing="ij")
+    here = torch.stack(places[::-1], -1).to(data)
+
+    def stretched(mm: float) -> Volume:
+        moved = mm * (height / (far - near + mm)).clamp(0, 1)  # of what lands at that height
+        source = here - moved[..., None] * shift
+        return volume.with_data(F.grid_sample(data[None, None], source[None], align_corners=True)[0, 0])
+
+    return stretched

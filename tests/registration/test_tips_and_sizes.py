@@ -16,7 +16,7 @@ from femoreg_torch.registration.device_doubts import doubts_about_size, doubts_a
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.registration.sizes import device_size
-from femoreg_torch.registration.tips import _parted, _stretched, tip_length
+from femoreg_torch.registration.tips import _parted, _stretching, tip_length
 from femoreg_torch.volume import Volume, axis_aligned
 
 TRUTH = true_poses()
@@ -165,7 +165,7 @@ def test_an_end_is_drawn_out_by_so_much_and_all_else_stays(mm: int) -> None:
     parted = _parted(whole, TIP, axis)
     assert parted is not None
     rest, end = parted
-    drawn_out = _stretched(end, TIP, axis, mm)
+    drawn_out = _stretching(end, TIP, axis)(mm)
     shift = ((end.lps_from_index[:3, 3] - whole.lps_from_index[:3, 3]) / 1.0).round().int().tolist()
     column = drawn_out.data[:, 24 - shift[1], 24 - shift[0]]
     top = end.lps_from_index[2, 3] + 0.5 * (column > 0.05).nonzero().max() * 2
