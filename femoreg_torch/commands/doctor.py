@@ -15,10 +15,10 @@ class Finding:
 def doctor() -> int:
     """Look at this machine: versions, cores, memory, GPU; check the projector against a formula, and its speed.
 
-    Takes some ten seconds. The projector runs on the CPU and on each GPU that torch sees; its images and derivatives
-    are compared with the line integrals of a Gaussian ball, which have a formula. So is what a stage of a registration
-    minimises, its gradient and its curvature, with plain formulas in double precision. Ends with status 2 if something
-    is wrong that would make results wrong or impossible.
+    Takes some ten seconds, the first time on a GPU a minute. The projector runs on the CPU and on each GPU that torch
+    sees; its images and derivatives are compared with the line integrals of a Gaussian ball, which have a formula. So
+    is what a stage of a registration minimises, its gradient and its curvature, with plain formulas in double
+    precision. Ends with status 2 if something is wrong that would make results wrong or impossible.
     """
     from rich.console import Console
     from rich.markup import escape
