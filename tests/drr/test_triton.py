@@ -121,7 +121,7 @@ def test_cuda_agrees_with_the_cpu_on_images_and_gradients():
         image = project(moved, moving, camera)
         (image * weights.to(device)).sum().backward()
         results.append([t.detach().cpu().double() for t in (image, moving.grad, *(v.data.grad for v in moved))])
-    # The slope jumps from voxel to voxel, and random weights leave little of its sum: on the CPU, poses moved by 1e-5 mm
+    # The slope jumps from voxel to voxel, and random weights leave little of its sum: on the CPU, poses 1e-5 mm aside
     # have gradients by these that are 1 % off, as one sample lies on the other side of a plane of the grid.
     tolerances = [1e-4, 0.03, 1e-4, 1e-4]
     for ours, theirs, tolerance in zip(results[1], results[0], tolerances, strict=True):
