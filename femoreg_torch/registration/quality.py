@@ -170,7 +170,8 @@ def _assess_object(
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
     in_question = carm_in_question(scene, poses, covariance, limits)
-    rotation, translation = covariance.deviations(name) if in_question else covariance.by_images(name)
+    with_carm = covariance.deviations(name)
+    rotation, translation = with_carm if in_question else covariance.by_images(name)
     pull = covariance.pull(name)
     axis = scene.objects[name].axis
     judged = _Judged.of(covariance, poses, name, axis, scene.anchor)
@@ -197,6 +198,8 @@ def _assess_object(
         reason is None,
         told,
         axis is None and _unturned(name, lost_by_turning, limits) is None,
+        tuple(with_carm[0]),
+        tuple(with_carm[1]),
     )
 
 

@@ -220,6 +220,32 @@ def test_the_covariance_grows_with_what_is_not_known_of_the_carm(scene: Scene) -
     assert found[0].relative_mm("pelvis", "pelvis") == [0, 0, 0]
 
 
+@pytest.mark.parametrize("shift_mm", [(2.0, 0.0), (0.0, -2.0)])
+def test_deviations_with_the_carm_cover_what_a_wrong_principal_point_does(
+    scene: Scene, shift_mm: tuple[float, float]
+) -> None:
+    """By one deviation of a file that says nothing, in all views: all objects go aside together, unseen."""
+    wrong = _wrong(scene, 1.0, shift_mm)
+    fixed = replace(_stage(), bodies=_stage().bodies[:-1])
+    poses = run_stage(wrong, true_poses(), fixed, (0, 1, 2), 0).poses
+    for name, quality in assess(wrong, poses, Limits()).items():
+        point = torch.cat([REFERENCE_POINTS[name], float64(1)])
+        off_mm = ((poses.camera1_from[name] - true_poses().camera1_from[name]) @ point)[:3].abs()
+        images, with_carm = (
+            float64(*of) for of in (quality.translation_deviation_mm, quality.translation_deviation_with_carm_mm)
+        )
+        assert quality.trusted
+        assert float((off_mm / images).max()) > 4
+        assert float((off_mm / with_carm).max()) < 2
+
+
+def test_where_the_file_says_how_uncertain_it_is_both_deviations_are_one(scene: Scene) -> None:
+    told = replace(scene, carm=replace(CARM, uncertainty=Uncertainty()))
+    for quality in assess(told, true_poses(), Limits()).values():
+        assert quality.translation_deviation_with_carm_mm == quality.translation_deviation_mm
+        assert quality.rotation_deviation_with_carm_deg == quality.rotation_deviation_deg
+
+
 @pytest.mark.parametrize(
     ("display", "place"),
     [
