@@ -1,5 +1,6 @@
 """What was measured at a solution about every object in every view, and whether it is trusted."""
 
+import math
 from dataclasses import dataclass
 
 
@@ -28,6 +29,10 @@ class ObjectQuality:
     trusted: bool
     reason: str
     turn_told: bool = True  # False for a round object, whose turn about its own axis no image tells
+    # The same deviations with what is not known of the C-arm in any case: where its file is silent, that of a C-arm
+    # which nobody has calibrated. It moves all objects together.
+    rotation_deviation_with_carm_deg: tuple[float, ...] = (math.nan,) * 3
+    translation_deviation_with_carm_mm: tuple[float, ...] = (math.nan,) * 3
 
 
 @dataclass(frozen=True)

@@ -277,6 +277,8 @@ def _object_quality(fields: Fields, count: int) -> ObjectQuality:
         trusted=fields.content.get("trusted") is True,
         reason=reason if isinstance(reason, str) else "no reason given",
         turn_told=fields.content.get("turn_told") is not False,
+        rotation_deviation_with_carm_deg=_several(fields, "rotation_deviation_with_carm_deg", 3),
+        translation_deviation_with_carm_mm=_several(fields, "translation_deviation_with_carm_mm", 3),
     )
 
 

@@ -1,20 +1,24 @@
 """What images with a device show besides it: cement, a hand, or another wire, which it may have been taken for.
 
 Images without and with a device, from one C-arm pose, differ in what came between them: in the logarithm of intensity
-by the shadow of the device, and by nothing elsewhere. Where they differ there, something else came or went.
+by the shadow of the device, and by nothing elsewhere. Where they differ there, something else came or went. Scattered
+light differs too, as the device takes some away, and the more so the less light goes straight through the patient. But
+a shadow has an edge, and scattered light has none.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 from torch.nn import functional as F
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import natural
-from femoreg_torch.geometry import Poses, transform_points
+from femoreg_torch.geometry import Camera, Poses, transform_points
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.imaging import Imaging, draw
 from femoreg_torch.registration.level import Level
@@ -26,7 +30,8 @@ from femoreg_torch.similarity import GradNcc
 _LEVEL = Level(pixel_mm=3.1, step_mm=1.0)
 _SIMILARITY = GradNcc(patch_radius=5)
 _SHADOW = 0.15  # of the logarithm of intensity: what is seen of 0.15 mm of steel or 8 mm of water
-_AROUND_MM = 6.0  # on the detector, beside what is drawn: of a pose or model that is a little wrong
+_LEAST_STEP = 0.5  # of that: by how much a shadow is stronger within its edge than beyond it
+_AROUND_MM = 6.0  # on the detector, beside what is drawn: of a pose or model that is a little wrong; and of an edge
 _LEAST_SHARE, _LEAST_MM2 = 0.2, 150.0  # of the device's own shadow, and on the detector
 _INSIDE = 0.2  # of the greatest attenuation: what counts as the device
 _MOST_POINTS = 5_000
@@ -96,8 +101,23 @@ def _look(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Besid
     change = with_it - without
     change = change - change[elsewhere].median()  # exposures differ
     mm2 = math.prod(camera.pixel_mm)
-    areas = (drawn & exposed & (change > _SHADOW), elsewhere & (change > _SHADOW), elsewhere & (change < -_SHADOW))
+    areas = (drawn & exposed & (change > _SHADOW), *(_shadows(way, elsewhere, camera) for way in (change, -change)))
     return Besides(view, *(mm2 * int(area.count_nonzero()) for area in areas))
+
+
+def _shadows(change: Tensor, where: Tensor, camera: Camera) -> Tensor:
+    """Pixels (H, W) of a change that are shadows: of those that hang together, the change ends with a step."""
+    values, asked = change.cpu().double().numpy(), where.cpu().numpy()
+    inside = asked & (values > _SHADOW)
+    parts, count = ndimage.label(inside)
+    away, nearest = ndimage.distance_transform_edt(~inside, sampling=camera.pixel_mm, return_indices=True)
+    rim = inside & (ndimage.distance_transform_edt(inside, sampling=camera.pixel_mm) <= _AROUND_MM)
+    around = np.where(asked & ~inside & (away <= _AROUND_MM), parts[tuple(nearest)], 0)
+    has_step = np.zeros(count + 1, dtype=bool)
+    for part in range(1, count + 1):
+        beside = values[around == part]
+        has_step[part] = not len(beside) or values[rim & (parts == part)].mean() - beside.mean() > _LEAST_STEP * _SHADOW
+    return torch.from_numpy(has_step[parts])
 
 
 def rival(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -> Rival | None:

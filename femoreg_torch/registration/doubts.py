@@ -28,7 +28,7 @@ from femoreg_torch.registration.misfits import misfits
 from femoreg_torch.registration.motion import MotionBetween
 from femoreg_torch.registration.orbit import orbits
 from femoreg_torch.registration.quality import Limits, shift_px
-from femoreg_torch.registration.rigidity import CUTS, bend
+from femoreg_torch.registration.rigidity import CUTS, Bend, bend
 from femoreg_torch.registration.scene import Scene
 
 # A mobile C-arm that turns about its orbit comes back within some mm and degrees (the paper draws 2 mm and 1°), and
@@ -291,21 +291,10 @@ def doubts_about_rigidity(scene: Scene, poses: Poses, imaging: Imaging) -> tuple
     """Objects whose ends do not lie as their models have them, in words; the anchor is asked where it is alone."""
     names = [name for name in poses.camera1_from if name != scene.anchor] or [scene.anchor]
     asked = [(name, share) for name in names for share in CUTS]
-    every = on_all_cores(lambda each: bend(scene, poses, *each, imaging), asked, scene.device)
+    every = on_all_cores(lambda each: _ends_apart(scene, poses, *each, imaging), asked, scene.device)
     told = []
     for name in names:
-        most, sure = (_MOST_APART_MM, 1.0) if scene.objects[name].parts else (_MOST_APART_OF_BONE_MM, _SURE_OF_BREAK)
-        ends = [found for (of, _), found in zip(asked, every, strict=True) if of == name and found is not None]
-        bent = [
-            each
-            for each in ends
-            if (
-                each.apart_mm > max(most, sure * each.apart_deviation_mm)
-                and each.sureness > _SURE_OF_BEND
-                and each.gain > _LEAST_GAIN_OF_BEND
-            )
-            or (not scene.objects[name].parts and each.gain > _GAIN_OF_BREAK and each.apart_mm > _APART_OF_BREAK_MM)
-        ]
+        bent = [found for (of, _), found in zip(asked, every, strict=True) if of == name and found is not None]
         if bent:
             found = max(bent, key=lambda each: each.apart_mm)
             told.append(
@@ -314,3 +303,19 @@ def doubts_about_rigidity(scene: Scene, poses: Poses, imaging: Imaging) -> tuple
                 "images, that more than an end of it is in view, and that no images are exchanged"
             )
     return tuple(told)
+
+
+def _ends_apart(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging) -> Bend | None:
+    """How the ends of an object lie apart, if they do, and still do without turns that no image tells."""
+    for only_told in (False, True):
+        found = bend(scene, poses, name, share, imaging, only_told)
+        if found is None or not _is_bent(found, bool(scene.objects[name].parts)):
+            return None
+    return found
+
+
+def _is_bent(found: Bend, is_model: bool) -> bool:
+    most, sure = (_MOST_APART_MM, 1.0) if is_model else (_MOST_APART_OF_BONE_MM, _SURE_OF_BREAK)
+    apart = found.apart_mm > max(most, sure * found.apart_deviation_mm)
+    broken = not is_model and found.gain > _GAIN_OF_BREAK and found.apart_mm > _APART_OF_BREAK_MM
+    return broken or (apart and found.sureness > _SURE_OF_BEND and found.gain > _LEAST_GAIN_OF_BEND)

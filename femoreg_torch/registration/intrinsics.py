@@ -1,7 +1,8 @@
 """The C-arm's intrinsics as degrees of freedom: one source distance for all views, a principal point for each."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -20,6 +21,9 @@ PRIOR_WEIGHT = 2e-5
 # all views together, 2.3 mm (3.7 mm). Views by themselves asked for up to 14 mm.
 _MISFIT_SDD = 0.0025
 _MISFIT_MM = 3.0
+
+# Of the C-arm's file, what is doubted by itself.
+DISTANCE, POINTS = "source distance", "principal points"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +54,13 @@ class Intrinsics:
     def units_off(self) -> Tensor:
         """How far the free ones lie from the C-arm's file, (n,), in standard deviations."""
         return (self.offset / self.scale)[self.free]
+
+    def only(self, parts: Collection[str]) -> "Intrinsics":
+        """The same with nothing free but `DISTANCE` or `POINTS`."""
+        scale = self.scale.clone()
+        scale[:1] *= DISTANCE in parts
+        scale[1:] *= POINTS in parts
+        return replace(self, scale=scale)
 
     def changes(self, delta: Tensor) -> tuple[CameraChange, ...]:
         """How the camera of every view changes with a delta (n,)."""
@@ -98,12 +109,31 @@ def profile(model: Quadratic, intrinsics: Intrinsics) -> Profile:
     return Profile(answer, hessian[n:, n:] + hessian[n:, :n] @ answer, scores)
 
 
-def doubt(model: Quadratic, intrinsics: Intrinsics) -> float:
-    """By how many standard deviations the images doubt the C-arm's file: the most doubtful of what it says counts.
+def refined(changes: Sequence[CameraChange]) -> frozenset[str]:
+    """Which parts of the C-arm's file cameras that changed so no longer have: `DISTANCE`, `POINTS`."""
+    distance = any(change.sdd_factor != 1 for change in changes)
+    points = any(shift != 0 for change in changes for shift in change.principal_point_shift_mm)
+    return frozenset([DISTANCE] * distance + [POINTS] * points)
+
+
+def doubted(model: Quadratic, intrinsics: Intrinsics, least: float) -> frozenset[str]:
+    """What images doubt by so many standard deviations, and what is to be refined for that: `DISTANCE`, `POINTS`.
+
+    A distance that is doubted lets the principal points go too. Points that are leave the distance as it is, if the
+    images do not doubt that as well: it would take everything with it into the depth.
+    """
+    found = doubts(model, intrinsics)
+    if found[DISTANCE] >= least:
+        return frozenset([DISTANCE, POINTS])
+    return frozenset([POINTS] if found[POINTS] >= least else [])
+
+
+def doubts(model: Quadratic, intrinsics: Intrinsics) -> dict[str, float]:
+    """By how many standard deviations the images doubt the C-arm's file: its `DISTANCE`, and its `POINTS`.
 
     It says three things: a source distance, and x and y of a principal point, for all views alike, so that its mistakes
     are the same in all. A single view that asks for a principal point of its own asks for sag, or for what is drawn a
-    little wrong, which is no reason to let the source distance go.
+    little wrong, which is no reason to let them go. Of x and y the more doubtful counts.
     A step of Newton along each by itself, the bodies refitted, is compared with its deviation: that of the sandwich
     estimator over tiles, and what images that are drawn a little wrong feign.
     """
@@ -115,5 +145,6 @@ def doubt(model: Quadratic, intrinsics: Intrinsics) -> float:
     scores = found.scores @ ways
     feigned = (ways * (found.curvature @ ways)).sum(0) * misfit
     deviation = (scores.square().sum(0) + feigned.square()).sqrt()
-    doubts = (scores.sum(0).abs() / deviation)[ways.any(0)]
-    return float(doubts.max()) if len(doubts) else 0.0
+    free = ways.any(0)
+    distance, x, y = torch.where(free, scores.sum(0).abs() / deviation, torch.zeros_like(deviation)).tolist()
+    return {DISTANCE: distance, POINTS: max(x, y)}

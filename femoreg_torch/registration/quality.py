@@ -31,7 +31,7 @@ from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.roundness import Axis
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
-from femoreg_torch.registration.turns import loss_by_turning
+from femoreg_torch.registration.turns import TOLD, loss_by_turning
 from femoreg_torch.similarity import GradNcc
 
 _LEVEL = Level(pixel_mm=1.55, step_mm=0.5)
@@ -54,9 +54,7 @@ class Limits:
     most_deviation_mm: float = 1.0  # standard deviation along any axis
     most_deviation_deg: float = 0.6  # and about any axis
     most_intrinsics_sigma: float = 3.0  # of the C-arm's file, between what it says and what the images fit
-    # Of mean patch NCC, turning a device about its long axis: four simulated devices lost 0.16 to 0.21. A round guide
-    # whose handle no image showed lost 0.003 at most, by voxels that are not quite round.
-    least_loss_by_turning: float = 0.008
+    least_loss_by_turning: float = TOLD
     rival_cost: float = 0.005  # another start of a stage that ended so little above the best,
     rival_deg: float = 15.0  # but so far away
     rival_mm: float = 50.0  # or so far, is a rival; what is nearer, the following stages tell apart
@@ -172,7 +170,8 @@ def _assess_object(
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
     in_question = carm_in_question(scene, poses, covariance, limits)
-    rotation, translation = covariance.deviations(name) if in_question else covariance.by_images(name)
+    with_carm = covariance.deviations(name)
+    rotation, translation = with_carm if in_question else covariance.by_images(name)
     pull = covariance.pull(name)
     axis = scene.objects[name].axis
     judged = _Judged.of(covariance, poses, name, axis, scene.anchor)
@@ -199,6 +198,8 @@ def _assess_object(
         reason is None,
         told,
         axis is None and _unturned(name, lost_by_turning, limits) is None,
+        tuple(with_carm[0]),
+        tuple(with_carm[1]),
     )
 
 

@@ -3,8 +3,13 @@
 A device that was bent since its model was drawn, or a bone that broke since the CT, is registered as a compromise, or
 as the larger part of it, and neither one view nor all together ask for another pose. But were the object cut across its
 long axis, the images would move its ends apart.
+
+The shaft of a long bone is nearly round. Derivatives do not say that no image tells its turn about its long axis
+(`registration.turns`): what the voxels draw, and a pin that crosses it, turned such an end by 17°. So ends that seem
+to lie apart are asked again, without the turns of an end about its long axis that it may go on by for nearly nothing.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,11 +19,12 @@ from torch import Tensor
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, log_so3, project_points, transform_points
 from femoreg_torch.geometry.rigid import skew
-from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import ImageCosts, image_costs, image_quadratic, stage_objective
 from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene, moved
+from femoreg_torch.registration.turns import TOLD, long_axis
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume
 
@@ -27,8 +33,10 @@ _SIMILARITY = GradNcc(patch_radius=5)
 _OPTIMISER = LevenbergMarquardt(max_iterations=6, tol_x=0.05, tol_f=1e-4)
 _SCALE = (0.03, 0.03, 0.03, 2.0, 2.0, 6.0)  # rad and mm: one unit of a motion
 CUTS = 0.33, 0.5, 0.67  # shares of a length that are tried
+_TURN_DEG = 20.0  # about its long axis, to both sides: an end that loses next to nothing by that is not turned
 _INSIDE = 0.2  # of the greatest attenuation: what counts as the object
 _MOST_POINTS = 2_000
+_LEAST_DEVIATION = 1e-6  # degrees and mm: a turn that is held has none but by rounding
 _LEAST_POINTS, _LEAST_SHARE = 30, 0.05  # of each end, among those that the images show
 
 
@@ -50,7 +58,7 @@ class Bend:
     @property
     def sureness(self) -> float:
         """The motion by its standard deviations: the most certain of its six parts."""
-        return float((self.motion.abs() / self.deviation).max())
+        return float((self.motion.abs() / self.deviation.clamp_min(_LEAST_DEVIATION)).max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,54 +67,111 @@ class _Ends:
 
     objects: tuple[RigidObject, RigidObject]
     points: tuple[Tensor, Tensor]
-    cut: Tensor  # (3,) its middle
+    middle: Tensor  # (3,) of the cut
 
 
-def bend(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging) -> Bend | None:
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """An object cut in two, in a scene that has both ends, and the images that are asked."""
+
+    scene: Scene
+    names: tuple[str, str]  # of the ends
+    ends: _Ends
+    shown: tuple[str, ...]  # all but the object itself
+    images: list[tuple[Kind, int]]
+    imaging: Imaging
+
+    def asked(self, poses: Poses, level: Level) -> tuple[tuple[Body, ...], ImageCosts]:
+        """The ends as bodies, and what images at a level say of their motions. Raises `InputError` if nothing."""
+        bodies = tuple(_body(poses, *end) for end in zip(self.names, self.ends.points, strict=True))
+        render = [*self.shown, *self.names]
+        return bodies, image_costs(
+            self.scene, poses, bodies, render, self.images, level, _SIMILARITY, imaging=self.imaging
+        )
+
+    def fitted(self, poses: Poses, ways: Tensor) -> "_Fitted":
+        """Where the ends fit, from their poses, as far as they go along some ways (12, n)."""
+        for level in _LEVELS:
+            bodies, costs = self.asked(poses, level)
+            objective = _along(stage_objective(costs, bodies, None), ways)
+            delta = ways @ _OPTIMISER.minimise(objective, ways.shape[1], seed=0).delta
+            poses = moved(poses, bodies, delta)
+        model = image_quadratic(costs, delta)
+        inverse = ways @ torch.linalg.pinv(ways.T @ model.hessian @ ways, hermitian=True) @ ways.T
+        return _Fitted(poses, bodies, model.value, inverse @ (model.scores.T @ model.scores) @ inverse)
+
+    def told(self, poses: Poses) -> Tensor:
+        """The motions (12, n) of the ends that images tell, see `_told`."""
+        points = zip(self.names, self.ends.points, strict=True)
+        axes = [long_axis(transform_points(poses.camera1_from[name], of)) for name, of in points]
+        return _told(*self.asked(poses, _LEVELS[-1]), axes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """Where both ends fit the images."""
+
+    poses: Poses
+    bodies: tuple[Body, ...]  # as they were before the last motion
+    cost: float
+    spread: Tensor  # (12, 12): covariance of the last motion
+
+
+def bend(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging, only_told: bool = False) -> Bend | None:
     """Of an object at its pose, cut at a share of its length as far as it is seen; all else stays where it is.
+
+    With `only_told`, an end does not turn about its long axis where no image tells that turn.
 
     None where the images show too little of one end, or nothing of them is exposed.
     """
-    images: list[tuple[Kind, int]] = []
-    for view in range(scene.views):
-        images += scene.there(scene.objects[name].shown_in, (view,))[:1]
-    ends = _cut(scene, poses, name, share, images)
-    if ends is None:
+    cut = _cut(scene, poses, name, share, imaging)
+    if cut is None:
         return None
-    pose, names = poses.camera1_from[name], (f"{name}, one end", f"{name}, the other")
-    scene = replace(scene, objects=scene.objects | dict(zip(names, ends.objects, strict=True)))
-    shown = [other for other in poses.camera1_from if other != name]
-    for each in names:
-        poses = poses.with_object(each, pose)
-
-    def asked(level: Level) -> tuple[tuple[Body, ...], ImageCosts]:
-        bodies = tuple(_body(poses, *end) for end in zip(names, ends.points, strict=True))
-        return bodies, image_costs(scene, poses, bodies, [*shown, *names], images, level, _SIMILARITY, imaging=imaging)
-
+    uncut = poses
+    for each in cut.names:
+        uncut = uncut.with_object(each, poses.camera1_from[name])
     try:
         for level in _LEVELS:
-            bodies, costs = asked(level)
+            costs = cut.asked(uncut, level)[1]
     except InputError:  # what is saturated leaves nothing to compare
         return None
-    uncut = float(costs(torch.zeros(1, len(costs.still), dtype=torch.float64)).mean())
-    for level in _LEVELS:
-        bodies, costs = asked(level)
-        found = _OPTIMISER.minimise(stage_objective(costs, bodies, None), len(costs.still), seed=0).delta
-        poses = moved(poses, bodies, found)
-    model = image_quadratic(costs, found)
-    inverse = torch.linalg.pinv(model.hessian, hermitian=True)
-    spread = inverse @ (model.scores.T @ model.scores) @ inverse
+    found = cut.fitted(uncut, torch.eye(len(costs.still), dtype=torch.float64))
+    if only_told:
+        found = cut.fitted(uncut, cut.told(found.poses))
 
-    first, second = (poses.camera1_from[each] for each in names)
-    one, other = (transform_points(of, ends.cut[None])[0] for of in (first, second))
+    first, second = (found.poses.camera1_from[each] for each in cut.names)
+    one, other = (transform_points(of, cut.ends.middle[None])[0] for of in (first, second))
     turn = log_so3(first[:3, :3] @ second[:3, :3].T) * 180 / torch.pi
     motion = torch.cat([turn, one - other])
-    by_delta = torch.cat([_at(one, bodies[0]), -_at(other, bodies[1])], 1)
-    covariance = by_delta @ spread @ by_delta.T
+    by_delta = torch.cat([_at(one, found.bodies[0]), -_at(other, found.bodies[1])], 1)
+    covariance = by_delta @ found.spread @ by_delta.T
     apart, deviation = min(
-        _displacement(motion, covariance, transform_points(second, of) - other) for of in ends.points
+        _displacement(motion, covariance, transform_points(second, of) - other) for of in cut.ends.points
     )
-    return Bend(motion, covariance.diagonal().sqrt(), apart, deviation, uncut - model.value)
+    gain = float(costs(costs.still[None]).mean()) - found.cost
+    return Bend(motion, covariance.diagonal().sqrt(), apart, deviation, gain)
+
+
+def _told(bodies: Sequence[Body], costs: ImageCosts, axes: Sequence[Tensor]) -> Tensor:
+    """The motions (12, n) of two ends that images tell: all but turns of each about its own one of `axes` (3,)."""
+    turns = torch.zeros(len(bodies), len(costs.still), dtype=torch.float64)
+    for n, (body, axis) in enumerate(zip(bodies, axes, strict=True)):
+        turns[n, 6 * n : 6 * n + 3] = axis / body.scale[:3]
+    far = math.radians(_TURN_DEG) * turns
+    still, *turned = costs(torch.cat([costs.still[None], far, -far])).mean(1).tolist()
+    lost = [min(pair) - still for pair in zip(turned[: len(bodies)], turned[len(bodies) :], strict=True)]
+    held = turns[[loss < TOLD for loss in lost]]
+    return torch.linalg.svd(held).Vh[len(held) :].T
+
+
+def _along(objective: SmoothObjective, ways: Tensor) -> SmoothObjective:
+    """An objective of how far its unknowns go along some ways (n, m) alone."""
+
+    def quadratic(delta: Tensor) -> Quadratic:
+        model = objective.quadratic(ways @ delta)
+        return Quadratic(model.value, model.scores @ ways, ways.T @ model.hessian @ ways)
+
+    return SmoothObjective(lambda deltas: objective.values(deltas @ ways.T), quadratic)
 
 
 def _displacement(motion: Tensor, covariance: Tensor, arms: Tensor) -> tuple[float, float]:
@@ -128,7 +193,20 @@ def _at(point: Tensor, body: Body) -> Tensor:
     return response * body.scale * torch.tensor([180 / torch.pi] * 3 + [1.0] * 3, dtype=torch.float64)
 
 
-def _cut(scene: Scene, poses: Poses, name: str, share: float, images: Sequence[tuple[Kind, int]]) -> _Ends | None:
+def _cut(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging) -> _Cut | None:
+    images: list[tuple[Kind, int]] = []
+    for view in range(scene.views):
+        images += scene.there(scene.objects[name].shown_in, (view,))[:1]
+    ends = _ends(scene, poses, name, share, images)
+    if ends is None:
+        return None
+    names = f"{name}, one end", f"{name}, the other"
+    scene = replace(scene, objects=scene.objects | dict(zip(names, ends.objects, strict=True)))
+    shown = tuple(other for other in poses.camera1_from if other != name)
+    return _Cut(scene, names, ends, shown, images, imaging)
+
+
+def _ends(scene: Scene, poses: Poses, name: str, share: float, images: Sequence[tuple[Kind, int]]) -> _Ends | None:
     thing = scene.objects[name]
     volume, data = thing.volume, thing.volume.data
     filled = (data > _INSIDE * data.max()).nonzero().cpu()

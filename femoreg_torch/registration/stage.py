@@ -14,7 +14,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
 from femoreg_torch.optimize import Optimiser
 from femoreg_torch.registration.imaging import PLAIN, Imaging
-from femoreg_torch.registration.intrinsics import Intrinsics, doubt
+from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, Intrinsics, doubted, refined
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.moments import moments_of
 from femoreg_torch.registration.objective import ImageCosts, Prior, image_costs, image_quadratic, stage_objective
@@ -52,7 +52,8 @@ class BodyPlan:
     [intrinsics] are the cameras themselves: the source distance of all views and the principal point of each, as far as
     the C-arm's file is uncertain of them. With `doubt` they move only where they were refined before, or where the
     images, all else settled, doubt the file by so many standard deviations (infinite: they are not asked): images that
-    are drawn a little wrong feign a little other intrinsics, and a C-arm's file may be right.
+    are drawn a little wrong feign a little other intrinsics, and a C-arm's file may be right. Where images doubt the
+    principal points alone, the source distance stays.
     """
 
     move: list[str]
@@ -199,10 +200,6 @@ class Stage:
         """How strongly the images must doubt the C-arm's file before its intrinsics move; None: they need not."""
         return next((plan.doubt for plan in self.bodies if plan.doubt is not None), None)
 
-    def with_free_intrinsics(self) -> "Stage":
-        """The same stage with intrinsics that wait for no doubt."""
-        return replace(self, bodies=[replace(plan, doubt=None) for plan in self.bodies])
-
     @property
     def _moves_only_the_carm(self) -> bool:
         return bool(self.bodies) and all(body.is_carm for body in self.bodies)
@@ -212,18 +209,39 @@ def run_stage(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], 
     """Optimise the bodies of one stage over the given views (from 0).
 
     Where its intrinsics wait for a doubt, the images are asked once all else has settled; if they doubt the C-arm's
-    file, the stage goes on from there with the intrinsics free.
+    file, the stage goes on from there with what they doubt free.
     """
     began = time.perf_counter()
-    bodies = stage.moving(scene, poses, views)
-    waiting = None if poses.changes else stage.doubt
-    if waiting is not None:
-        bodies = tuple(body for body in bodies if isinstance(body, Body))
+    every = frozenset([DISTANCE, POINTS])
+    free = every if stage.doubt is None else refined(poses.changes)
+    record = _optimised(scene, poses, stage, views, seed, free)
+    more = free if free == every else free | _doubted(scene, record.poses, stage, views)
+    if more == free:
+        return replace(record, seconds=time.perf_counter() - began)
+    after = _optimised(scene, record.poses, stage, views, seed, more)
+    later = tuple(replace(m, evaluations=m.evaluations + record.evaluations) for m in after.moments)
+    return replace(
+        after,
+        evaluations=record.evaluations + after.evaluations,
+        seconds=time.perf_counter() - began,
+        restarts=record.restarts + after.restarts,
+        moments=record.moments + later,
+    )
+
+
+def _optimised(
+    scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], seed: int, free: frozenset[str]
+) -> StageRecord:
+    """The optimisation with no intrinsics free but those, see `Intrinsics.only`."""
+    began = time.perf_counter()
+    moving = stage.moving(scene, poses, views)
+    moving = tuple(body.only(free) if isinstance(body, Intrinsics) else body for body in moving)
+    bodies = tuple(body for body in moving if isinstance(body, Body) or len(body.free))
     objective = stage_objective(_costs(scene, poses, stage, views, bodies), bodies, stage.prior)
     result = stage.optimiser.minimise(objective, sum(len(body.free) for body in bodies), seed)
     rigid = [body for body in bodies if isinstance(body, Body)]
     turned = len(rigid) < len(bodies) or any(body.view for body in rigid)
-    record = StageRecord(
+    return StageRecord(
         stage.name,
         views[0] + 1 if stage.images == "each other" else None,
         result.value,
@@ -235,17 +253,6 @@ def run_stage(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], 
         moments_of(result, lambda delta: moved(poses, bodies, delta)),
         tuple(poses.camera1_from) if turned else tuple(name for body in rigid for name in body.objects),
     )
-    if waiting is None or _doubt(scene, record.poses, stage, views) < waiting:
-        return replace(record, seconds=time.perf_counter() - began)
-    after = run_stage(scene, record.poses, stage.with_free_intrinsics(), views, seed)
-    later = tuple(replace(m, evaluations=m.evaluations + record.evaluations) for m in after.moments)
-    return replace(
-        after,
-        evaluations=record.evaluations + after.evaluations,
-        seconds=time.perf_counter() - began,
-        restarts=record.restarts + after.restarts,
-        moments=record.moments + later,
-    )
 
 
 def _costs(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], bodies: tuple[Moving, ...]) -> ImageCosts:
@@ -256,13 +263,14 @@ def _costs(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], bod
     )
 
 
-def _doubt(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...]) -> float:
-    """By how many standard deviations the stage's images doubt the C-arm's file; 0 where it need not be asked."""
+def _doubted(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...]) -> frozenset[str]:
+    """What of the C-arm's file the stage's images doubt too much; nothing where it need not be asked."""
+    assert stage.doubt is not None  # or all of it were free
     if stage.doubt == math.inf:
-        return 0.0
+        return frozenset()
     bodies = stage.moving(scene, poses, views)
-    refined = next((body for body in bodies if isinstance(body, Intrinsics)), None)
-    if refined is None:
-        return 0.0
+    intrinsics = next((body for body in bodies if isinstance(body, Intrinsics)), None)
+    if intrinsics is None:
+        return frozenset()
     costs = _costs(scene, poses, stage, views, bodies)
-    return doubt(image_quadratic(costs, costs.still), refined)
+    return doubted(image_quadratic(costs, costs.still), intrinsics, stage.doubt)

@@ -43,6 +43,7 @@ GOOD = ObjectQuality(
     displacement=(1.0, 2.0),
     trusted=True,
     reason="all views agree",
+    translation_deviation_with_carm_mm=(1.3, 1.2, 2.1),
 )
 
 
@@ -97,6 +98,7 @@ def test_a_result_comes_back(tmp_path: Path, names: tuple[str, str, str]) -> Non
     assert again.skipped == result.skipped
     assert (again.preset, again.seed, again.case, again.timings_s) == ("fast", 3, "../case", {"total": 9.5})
     assert again.quality[other].rotation_deviation_deg == GOOD.rotation_deviation_deg
+    assert again.quality[other].translation_deviation_with_carm_mm == GOOD.translation_deviation_with_carm_mm
     assert again.quality[other].views[0] == GOOD.views[0]
     assert again.start is not None
     assert again.start.landmarks == result.start.landmarks  # type: ignore[union-attr]

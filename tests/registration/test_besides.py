@@ -58,6 +58,16 @@ def test_exposures_that_differ_are_nothing_beside_it() -> None:
     assert not any(found.more or found.less for found in besides(scene, TRUTH, "device", "device"))
 
 
+def test_scattered_light_that_differs_is_nothing_beside_it() -> None:
+    """Up to twice what is a shadow, without an edge."""
+    scene = make_scene(TRUTH)
+    row, column = torch.meshgrid(*[torch.arange(88.0) * 3 - 130] * 2, indexing="ij")
+    veil = 0.3 * (-((row + 80) ** 2 + (column + 60) ** 2) / (2 * 45.0**2)).exp()
+    veiled = tuple(scene.image("device", view) + veil for view in range(3))
+    scene = replace(scene, images=scene.images | {"device": veiled})
+    assert not any(found.more or found.less for found in besides(scene, TRUTH, "device", "device"))
+
+
 @pytest.mark.parametrize("at", [TRUTH.camera1_from["device"], ASIDE])
 def test_a_twin_is_told_from_either_of_the_two(at: Tensor) -> None:
     scene = with_rods(TRUTH, TRUTH.with_object("device", ASIDE))

@@ -13,7 +13,7 @@ from femoreg_torch.geometry import CameraChange, Poses, Uncertainty, rigid
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic
 from femoreg_torch.registration.covariance import pose_covariance
 from femoreg_torch.registration.doubts import doubts_about_the_carm
-from femoreg_torch.registration.intrinsics import doubt
+from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, doubted, doubts
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, image_quadratic, stage_objective
 from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance
@@ -144,22 +144,22 @@ def _images_that_ask(sdd: float, shifts_mm: list[tuple[float, float]]) -> Quadra
 
 
 @pytest.mark.parametrize(
-    ("sdd", "shifts_mm", "doubted"),
+    ("sdd", "shifts_mm", "to_refine"),
     [
-        (0.0, [(0, 0), (0, 0), (0, 0)], False),
-        (0.03, [(0, 0), (0, 0), (0, 0)], True),
-        (-0.03, [(0, 0), (0, 0), (0, 0)], True),
-        (0.0, [(0, 0), (0, 0), (0, -12)], False),  # a single view asks for what the file cannot have wrong
-        (0.0, [(8, 0), (-12, 0), (6, 0)], False),
-        (0.0, [(12, 0), (12, 0), (12, 0)], True),
-        (0.0, [(0, -12), (0, -12), (0, -12)], True),
+        (0.0, [(0, 0), (0, 0), (0, 0)], set()),
+        (0.03, [(0, 0), (0, 0), (0, 0)], {DISTANCE, POINTS}),
+        (-0.03, [(0, 0), (0, 0), (0, 0)], {DISTANCE, POINTS}),
+        (0.0, [(0, 0), (0, 0), (0, -12)], set()),  # a single view asks for what the file cannot have wrong
+        (0.0, [(8, 0), (-12, 0), (6, 0)], set()),
+        (0.0, [(12, 0), (12, 0), (12, 0)], {POINTS}),  # the distance, which nothing speaks against, stays
+        (0.0, [(0, -12), (0, -12), (0, -12)], {POINTS}),
     ],
 )
 def test_the_file_is_doubted_where_all_views_ask_alike(
-    scene: Scene, sdd: float, shifts_mm: list[tuple[float, float]], doubted: bool
+    scene: Scene, sdd: float, shifts_mm: list[tuple[float, float]], to_refine: set[str]
 ) -> None:
-    refined = intrinsics_of(scene, true_poses(), _ALL)
-    assert (doubt(_images_that_ask(sdd, shifts_mm), refined) > 3) == doubted
+    intrinsics = intrinsics_of(scene, true_poses(), _ALL)
+    assert doubted(_images_that_ask(sdd, shifts_mm), intrinsics, 3) == to_refine
 
 
 def test_what_the_file_holds_is_not_doubted(scene: Scene) -> None:
@@ -167,7 +167,7 @@ def test_what_the_file_holds_is_not_doubted(scene: Scene) -> None:
     held = replace(scene, carm=replace(CARM, uncertainty=sure))
     model = _images_that_ask(0.03, [(12, 12)] * 3)
     rigid = Quadratic(model.value, model.scores[:, :1], model.hessian[:1, :1])
-    assert doubt(rigid, intrinsics_of(held, true_poses(), _ALL)) == 0.0
+    assert doubts(rigid, intrinsics_of(held, true_poses(), _ALL)) == {DISTANCE: 0, POINTS: 0}
 
 
 def test_a_stage_that_does_not_ask_refines_what_was_refined_before(scene: Scene) -> None:
@@ -178,6 +178,13 @@ def test_a_stage_that_does_not_ask_refines_what_was_refined_before(scene: Scene)
     after = run_stage(wrong, begun, silent, (0, 1, 2), 0).poses.changes
     assert after
     assert after[0].sdd_factor != begun.changes[0].sdd_factor
+
+
+def test_where_the_principal_points_were_refined_alone_the_source_distance_stays(scene: Scene) -> None:
+    begun = true_poses().with_changes((CameraChange(principal_point_shift_mm=(1.5, 0.0)),) * 3)
+    after = run_stage(scene, begun, _stage(waits=math.inf, iterations=2), (0, 1, 2), 0).poses.changes
+    assert [change.sdd_factor for change in after] == [1, 1, 1]
+    assert all(after[view] != begun.changes[view] for view in range(3))
 
 
 def test_a_stage_that_goes_on_with_free_intrinsics_counts_both_parts(scene: Scene) -> None:
@@ -211,6 +218,32 @@ def test_the_covariance_grows_with_what_is_not_known_of_the_carm(scene: Scene) -
     assert depths[0] < depths[1] < depths[2]
     assert beside[0] < beside[1] < beside[2] < depths[2]
     assert found[0].relative_mm("pelvis", "pelvis") == [0, 0, 0]
+
+
+@pytest.mark.parametrize("shift_mm", [(2.0, 0.0), (0.0, -2.0)])
+def test_deviations_with_the_carm_cover_what_a_wrong_principal_point_does(
+    scene: Scene, shift_mm: tuple[float, float]
+) -> None:
+    """By one deviation of a file that says nothing, in all views: all objects go aside together, unseen."""
+    wrong = _wrong(scene, 1.0, shift_mm)
+    fixed = replace(_stage(), bodies=_stage().bodies[:-1])
+    poses = run_stage(wrong, true_poses(), fixed, (0, 1, 2), 0).poses
+    for name, quality in assess(wrong, poses, Limits()).items():
+        point = torch.cat([REFERENCE_POINTS[name], float64(1)])
+        off_mm = ((poses.camera1_from[name] - true_poses().camera1_from[name]) @ point)[:3].abs()
+        images, with_carm = (
+            float64(*of) for of in (quality.translation_deviation_mm, quality.translation_deviation_with_carm_mm)
+        )
+        assert quality.trusted
+        assert float((off_mm / images).max()) > 4
+        assert float((off_mm / with_carm).max()) < 2
+
+
+def test_where_the_file_says_how_uncertain_it_is_both_deviations_are_one(scene: Scene) -> None:
+    told = replace(scene, carm=replace(CARM, uncertainty=Uncertainty()))
+    for quality in assess(told, true_poses(), Limits()).values():
+        assert quality.translation_deviation_with_carm_mm == quality.translation_deviation_mm
+        assert quality.rotation_deviation_with_carm_deg == quality.rotation_deviation_deg
 
 
 @pytest.mark.parametrize(

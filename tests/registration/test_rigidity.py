@@ -1,15 +1,21 @@
 """An object that was bent since its model was made is told from a straight one."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from registration_scenes import KINDS, KINK_DEG, REFERENCE_POINTS, images_of_broken, make_scene, off, true_poses
 
+from femoreg_torch.case import Start
+from femoreg_torch.drr import project
+from femoreg_torch.geometry import Poses, exp_so3, load_carm, rigid
 from femoreg_torch.registration import Scene, doubts
 from femoreg_torch.registration.doubts import doubts_about_rigidity
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.rigidity import CUTS, Bend, bend
+from femoreg_torch.registration.scene import RigidObject
+from femoreg_torch.volume import Volume, axis_aligned
 
 TRUTH = true_poses()
 
@@ -64,3 +70,52 @@ def test_an_end_that_shutters_hide_is_not_asked(scene: Scene) -> None:
     behind = replace(scene, fields={"device": (shut, shut, None)})
     assert bend(behind, TRUTH, "device", 0.5, PLAIN) is None
     assert bend(behind, TRUTH, "femur", 0.5, PLAIN) is not None  # the images without the device are exposed
+
+
+def test_a_turn_that_no_image_tells_is_no_break() -> None:
+    """The shaft of a tibia is round. A pin that its model lacks crosses the cut, and asks the lower end to turn."""
+    scene, poses, name = _tibia(broken_deg=0.0)
+    free, told = (bend(scene, poses, name, 0.5, PLAIN, only_told) for only_told in (False, True))
+    assert free is not None
+    assert told is not None
+    assert free.apart_mm > 0.8  # with a gain of 0.003, both of which are those of broken necks
+    assert told.apart_mm < 0.6
+    assert doubts_about_rigidity(scene, poses, PLAIN) == ()
+
+
+def test_a_round_shaft_that_broke_is_doubted() -> None:
+    assert len(doubts_about_rigidity(*_tibia(broken_deg=6.0)[:2], PLAIN)) == 1
+
+
+def _tibia(broken_deg: float) -> tuple[Scene, Poses, str]:
+    """A round shaft with a crossbar on it, its upper end turned across its axis, in two views with a pin before it."""
+    spacing = 1.5
+    ticks = [torch.arange(-half, half + 0.1, spacing) for half in (60.0, 30.0, 36.0)]
+    z, y, x = torch.meshgrid(*ticks, indexing="ij")
+    places = torch.stack([x, y, z], -1)
+
+    def rod(start: tuple[float, ...], end: tuple[float, ...], radius: float) -> torch.Tensor:
+        first, along = torch.tensor(start), torch.tensor(end) - torch.tensor(start)
+        share = ((places - first) @ along / (along @ along)).clamp(0, 1)
+        return ((radius - (places - first - share[..., None] * along).norm(dim=-1)) / spacing + 0.5).clamp(0, 1)
+
+    bar = rod((-10.0, 0.0, 42.0), (12.0, 4.0, 44.0), 12.0)
+    tibia = 0.045 * torch.maximum(rod((0.0, 0.0, -55.0), (-4.0, 4.0, 30.0), 9.0), bar)
+    grid = axis_aligned((spacing,) * 3, (-36.0, -30.0, -60.0))
+    upper = z > 0
+    parts = [torch.where(upper, 0.0, tibia), torch.where(upper, tibia, 0.0)]
+    parts.append(0.25 * rod((-30.0, -20.0, -10.0), (30.0, -20.0, 20.0), 2.5))
+    parts.append(0.045 * rod((24.0, 12.0, -55.0), (22.0, 10.0, 32.0), 4.5))  # the fibula
+    carm = load_carm("cios_fusion")
+    camera = carm.camera.downsampled(12)
+    cameras = carm.orbit(torch.deg2rad(torch.tensor([0.0, 50.0], dtype=torch.float64)))
+    pose = torch.tensor([[1.0, 0, 0, 6], [0, 0, -1, 4], [0, 1, 0, 640], [0, 0, 0, 1]], dtype=torch.float64)
+    kink = pose @ rigid(exp_so3(torch.tensor([math.radians(broken_deg), 0, 0], dtype=torch.float64)))
+    places_of = torch.stack([cameras @ each for each in (pose, kink, pose, pose)], 1)
+    paths = project([Volume(part, grid) for part in parts], places_of, camera, 0.5)
+    counts = torch.poisson(20_000 * (-paths).exp(), generator=torch.Generator().manual_seed(1))
+    images = -(counts.clamp_min(1) / 20_000).log()
+    bone = Volume(torch.where(tibia > 0.0225, 0.021 + 0.4 * tibia, 0.0), grid)  # as a CT shows it, in soft tissue
+    shaft = RigidObject(bone, torch.zeros(3, dtype=torch.float64), ("image",), Start(camera1_from=pose))
+    scene = Scene(replace(carm, camera=camera), {"tibia": shaft}, {"image": tuple(images)}, camera_from_camera1=cameras)
+    return scene, scene.start(), "tibia"

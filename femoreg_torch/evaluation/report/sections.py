@@ -151,6 +151,13 @@ def _in_words(quality: ObjectQuality) -> Iterable[str]:
     mm = number(max(quality.translation_deviation_mm, default=math.nan), 2)
     degrees = number(max(quality.rotation_deviation_deg, default=math.nan), 2)
     yield f"Known to ± {mm} mm and ± {degrees}°: standard deviations along and about the least certain axis."
+    with_carm = quality.translation_deviation_with_carm_mm
+    if with_carm != quality.translation_deviation_mm and all(map(math.isfinite, with_carm)):
+        mm, degrees = number(max(with_carm), 2), number(max(quality.rotation_deviation_with_carm_deg), 2)
+        yield (
+            "That takes the C-arm's file at its word. With a source distance and principal points that nobody has "
+            f"calibrated: ± {mm} mm and ± {degrees}°, all objects together."
+        )
     pull_deg, pull_mm = (number(value, 2) for value in quality.common_pull)
     yield f"All images together would move it by {pull_mm} mm and {pull_deg}°, were everything else free."
     if quality.displacement is not None:
