@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -78,6 +79,16 @@ def test_numbers_that_are_not_trusted_are_told_without_uncertainty(case, scene, 
         assert ("not trusted: not to be used" in card.text_content()) is not uncertain
         assert ("±" in card.text_content()) is uncertain
         assert "0.00 mm" in card.text_content()
+
+
+def test_what_is_not_known_of_the_carm_is_told_where_the_deviations_do_not_hold_it(case, scene, result, drawn) -> None:
+    for with_carm, told in (((1.3, 1.2, 2.1), True), ((0.1, 0.1, 0.2), False), ((math.nan,) * 3, False)):
+        quality = {
+            name: replace(of, translation_deviation_mm=(0.1, 0.1, 0.2), translation_deviation_with_carm_mm=with_carm)
+            for name, of in result.quality.items()
+        }
+        page = html.fromstring(report_page(case, scene, replace(result, quality=quality), None, drawn)).text_content()
+        assert ("that nobody has calibrated: ± 2.10 mm" in " ".join(page.split())) is told
 
 
 def test_there_is_a_panel_for_every_image_with_each_object_in_its_colour(case, scene, result, drawn) -> None:
