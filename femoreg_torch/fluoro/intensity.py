@@ -77,6 +77,6 @@ def binned(attenuation: Tensor, factor: int) -> Tensor:
 
     Such pixels average intensities. Values that are not `natural` are averaged themselves.
     """
-    if not natural(attenuation):
+    if factor == 1 or not natural(attenuation):
         return downsample(attenuation, factor)
     return -downsample((-attenuation).clamp(-_EXTREME, _EXTREME).exp(), factor).log()

@@ -6,7 +6,7 @@ model are stretched and compressed along the guide, and the images near the tip 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -29,8 +29,9 @@ _SIMILARITY = GradNcc(patch_radius=3)
 _LONGEST_MM = 4  # by which the model is stretched or compressed, in steps of 1 mm
 _STRETCH_MM = 6.0, 14.0  # before the tip: where the model is stretched; nearer to the tip it keeps its shape
 _AROUND_MM = 12.0  # of the end of the guide: the box that is stretched, and, at the depth of the tip, what is looked at
-_MARGIN_PX = 8  # of the level, around what is looked at: what the patches and derivatives there need
 _LEAST_PIXELS = 200  # of an image, near the tip, for it to count
+_MARGIN_PX = 8  # of `_LEVEL`, around what is looked at: pixels that what is seen there is made of
+_GRID_PX = 2  # of `_LEVEL`: where a window may begin; soft tissue is drawn on pixels so much larger, and interpolated
 
 
 @dataclass(frozen=True)
@@ -53,44 +54,40 @@ def tip_length(
     """
     base, tip = (point.double() for point in guide)
     axis = (tip - base) / (tip - base).norm()
-    near = _near_the_tip(scene, poses, name, kind, tip, axis)
-    views = [view for view, mask in enumerate(near) if mask is not None and mask.sum() >= _LEAST_PIXELS]
-    if not views:
+    windows = {view: _near_the_tip(scene, poses, name, kind, view, tip, axis) for view in range(scene.views)}
+    near = {view: window for view, window in windows.items() if window is not None}
+    if not near:
         return None
     thing = scene.objects[name]
     parted = _parted(thing.volume, tip, axis)
     if parted is None:
         return None
-    rest, end = parted
     names = f"{name}, without its tip", f"{name}, its tip"
-    objects = [
+    rest, end = (
         RigidObject(part, thing.reference_point, thing.shown_in, sharp=thing.sharp, hardening=thing.hardening)
-        for part in (rest, end)
-    ]
+        for part in parted
+    )
     shown = [other for other in scene.shown(poses.camera1_from, kind) if other != name]
     for each in names:
         poses = poses.with_object(each, poses.camera1_from[name])
-    scene = replace(
-        scene,
-        objects=scene.objects | dict(zip(names, objects, strict=True)),
-        fields=scene.fields | {kind: tuple(near)},
-    )
+    objects = {other: scene.objects[other] for other in shown} | dict(zip(names, (rest, end), strict=True))
     still = Body((names[1],), 0, tip, torch.ones(6, dtype=torch.float64))
 
-    def costs_of(view: int) -> ImageCosts:
-        window, image = _around(scene, kind, view), [(kind, view)]
-        return image_costs(window, poses, (still,), [*shown, *names], image, _LEVEL, _SIMILARITY, imaging=imaging)
+    def costs_of(view: int, window: Scene) -> ImageCosts:
+        window = replace(window, objects=objects)
+        render = [*shown, *names]
+        return image_costs(window, poses, (still,), render, [(kind, view)], _LEVEL, _SIMILARITY, imaging=imaging)
 
     try:
-        costs = on_all_cores(costs_of, views, scene.device)
+        costs = [costs_of(view, window) for view, window in near.items()]
     except InputError:  # what is exposed leaves nothing to compare
         return None
     lengths = range(-_LONGEST_MM, _LONGEST_MM + 1)
-    stretched = _stretching(costs[0].objects[names[1]].volume, tip, axis)
+    drawn = costs[0].objects[names[1]].volume
 
     def cost(mm: float) -> float:
-        candidates = [of.with_object(names[1], replace(objects[1], volume=stretched(mm))) for of in costs]
-        return float(torch.cat([of(of.still[None]) for of in candidates]).mean())
+        stretched = replace(end, volume=_stretched(drawn, tip, axis, mm))
+        return sum(float(of.with_object(names[1], stretched)(of.still[None])) for of in costs) / len(costs)
 
     found = on_all_cores(cost, lengths, scene.device)
     best = min(max(min(range(len(found)), key=lambda n: found[n]), 1), len(found) - 2)
@@ -99,51 +96,72 @@ def tip_length(
     return TipLength(lengths[best] + between, found[_LONGEST_MM] - min(found))
 
 
-def _near_the_tip(scene: Scene, poses: Poses, name: str, kind: Kind, tip: Tensor, axis: Tensor) -> list[Tensor | None]:
-    """The exposed pixels (H, W), bool, of the images of a kind around the end of a guide; None where there is none."""
-    near: list[Tensor | None] = []
-    for view in range(scene.views):
-        if not scene.there([kind], [view]):
-            near.append(None)
-            continue
-        image, camera, pose = scene.image(kind, view), scene.camera(poses, view), poses.camera_from(name)[view]
-        ends = transform_points(pose, torch.stack([tip - _STRETCH_MM[0] * axis, tip + _LONGEST_MM * axis]))
-        (u0, v0), (u1, v1) = project_points(camera, ends).tolist()
-        radius = _AROUND_MM * camera.sdd_mm / float(ends[1, 2]) / camera.mean_pixel_mm
-        rows, columns = (torch.arange(n, device=image.device) for n in image.shape)
-        run_u, run_v = u1 - u0, v1 - v0
-        x, y = columns[None] - u0, rows[:, None] - v0
-        along = ((x * run_u + y * run_v) / max(run_u**2 + run_v**2, 1e-9)).clamp(0, 1)
-        mask = (x - along * run_u) ** 2 + (y - along * run_v) ** 2 <= radius**2
-        exposed = scene.field(kind, view)
-        near.append(mask if exposed is None else mask & exposed)
-    return near
+def _near_the_tip(
+    scene: Scene, poses: Poses, name: str, kind: Kind, view: int, tip: Tensor, axis: Tensor
+) -> Scene | None:
+    """The scene through a window around the end of a guide, in pixels of `_LEVEL`: it has the images of one view alone.
 
-
-def _around(scene: Scene, kind: Kind, view: int) -> Scene:
-    """The scene of one view with images of what is exposed of the image of a kind, and a little around."""
-    exposed = scene.field(kind, view)
-    assert exposed is not None  # what is near the tip
+    In that of `kind` only what lies near the tip is exposed. None where too little of it is.
+    """
+    if not scene.there([kind], [view]):
+        return None
+    camera, pose = scene.camera(poses, view), poses.camera_from(name)[view]
+    ends = transform_points(pose, torch.stack([tip - _STRETCH_MM[0] * axis, tip + _LONGEST_MM * axis]))
+    pixels = project_points(camera, ends)
+    if not bool(pixels.isfinite().all()):  # behind the source
+        return None
+    radius = _AROUND_MM * camera.sdd_mm / float(ends[1, 2]) / camera.mean_pixel_mm
+    coarse = _LEVEL.camera(scene.carm.camera)
     factor = binning(_LEVEL.pixel_mm, scene.carm.camera)
-    seen = [exposed.any(1 - axis).nonzero()[:, 0] for axis in range(2)]
-    first = [max(int(of[0]) // factor - _MARGIN_PX, 0) * factor for of in seen]
-    last = [(int(of[-1]) // factor + 1 + _MARGIN_PX) * factor for of in seen]
-    window = slice(first[0], last[0]), slice(first[1], last[1])
+    first = ((pixels.amin(0) - radius) / factor).floor().long() - _MARGIN_PX
+    last = ((pixels.amax(0) + radius) / factor).ceil().long() + _MARGIN_PX
+    columns, rows = (
+        slice(max(0, int(a)) // _GRID_PX * _GRID_PX, min(size, int(b)))
+        for a, b, size in zip(first, last, coarse.shape[::-1], strict=True)
+    )
+    if rows.stop <= rows.start or columns.stop <= columns.start:
+        return None
+    inside = slice(rows.start * factor, rows.stop * factor), slice(columns.start * factor, columns.stop * factor)
+    exposed = scene.field(kind, view)
+    mask = _around(pixels.tolist(), radius, *inside).to(scene.device)
+    if exposed is not None:
+        mask &= exposed[inside]
+    if mask.sum() < _LEAST_PIXELS:
+        return None
+    first_field = scene.field(scene.first_kind, view)
+    fields = {scene.first_kind: None if first_field is None else first_field[inside], kind: mask}
 
-    def cut(images: dict[Kind, tuple[Tensor | None, ...]]) -> dict[Kind, tuple[Tensor | None, ...]]:
-        return {
-            kind: tuple(one[window] if n == view and one is not None else None for n, one in enumerate(of))
-            for kind, of in images.items()
-        }
+    def of_this_view(there: Tensor | None) -> tuple[Tensor | None, ...]:
+        return tuple(there if one == view else None for one in range(scene.views))
 
-    carm = replace(scene.carm, camera=scene.carm.camera.window(*window))
-    return replace(scene, carm=carm, images=cut(scene.images), fields=cut(scene.fields), saturated={})
+    return replace(
+        scene,
+        carm=replace(scene.carm, camera=coarse.window(rows, columns)),
+        images={
+            of: of_this_view(_LEVEL.image(scene.image(of, view), scene.carm.camera)[rows, columns].contiguous())
+            for of, _ in scene.there(dict.fromkeys((scene.first_kind, kind)), [view])
+        },
+        fields={
+            of: of_this_view(None if field is None else _LEVEL.field(field, scene.carm.camera))
+            for of, field in fields.items()
+        },
+    )
+
+
+def _around(ends: Sequence[tuple[float, float]], radius: float, rows: slice, columns: slice) -> Tensor:
+    """The pixels (H, W), bool, of a window that are no farther than a radius from the line between two of them."""
+    (u0, v0), (u1, v1) = ends
+    run_u, run_v = u1 - u0, v1 - v0
+    y, x = (torch.arange(part.start, part.stop) for part in (rows, columns))
+    x, y = x[None] - u0, y[:, None] - v0
+    along = ((x * run_u + y * run_v) / max(run_u**2 + run_v**2, 1e-9)).clamp(0, 1)
+    return (x - along * run_u) ** 2 + (y - along * run_v) ** 2 <= radius**2
 
 
 def _parted(volume: Volume, tip: Tensor, axis: Tensor) -> tuple[Volume, Volume] | None:
-    """All but a box around the end of a guide; and that box, with room for the guide to grow, on a grid of its own.
+    """All but a box around the end of a guide; and what is in it, with room for the guide to grow, on its own grid.
 
-    None if the box lies beside the volume.
+    None if nothing is in it.
     """
     inverse, size = torch.linalg.inv(volume.lps_from_index), torch.tensor(volume.data.shape).flip(0)
     ends = torch.stack([tip - _STRETCH_MM[1] * axis, tip + _LONGEST_MM * axis])
@@ -154,6 +172,12 @@ def _parted(volume: Volume, tip: Tensor, axis: Tensor) -> tuple[Volume, Volume] 
     if not bool((inside_first < inside_last).all()):
         return None
     x, y, z = (slice(int(a), int(b)) for a, b in zip(inside_first, inside_last, strict=True))
+    filled = volume.data[z, y, x].nonzero().flip(1).cpu()
+    if not len(filled):
+        return None
+    grown = _LONGEST_MM * inverse[:3, :3] @ axis
+    first = first.maximum(inside_first + filled.amin(0) + grown.clamp_max(0).floor().long() - 1)
+    last = last.minimum(inside_first + filled.amax(0) + grown.clamp_min(0).ceil().long() + 1)
     rest = volume.data.clone()
     rest[z, y, x] = 0
     around = [int(n) for pair in zip(inside_first - first, last + 1 - inside_last, strict=True) for n in pair]
@@ -162,8 +186,8 @@ def _parted(volume: Volume, tip: Tensor, axis: Tensor) -> tuple[Volume, Volume] 
     return volume.with_data(rest), Volume(F.pad(volume.data[z, y, x], around), affine)
 
 
-def _stretching(volume: Volume, tip: Tensor, axis: Tensor) -> Callable[[float], Volume]:
-    """A volume whose end along an axis is stretched by so many mm; compressed where they are negative."""
+def _stretched(volume: Volume, tip: Tensor, axis: Tensor, mm: float) -> Volume:
+    """A volume whose end along an axis is stretched by so much; compressed where it is negative."""
     data = volume.data
     size = torch.tensor(data.shape).flip(0)
     x, y, z = (torch.arange(n, dtype=torch.float64) for n in size.tolist())
@@ -171,15 +195,8 @@ def _stretching(volume: Volume, tip: Tensor, axis: Tensor) -> Callable[[float], 
     height = z[:, None, None] * rates[2] + y[:, None] * rates[1] + x * rates[0]
     height += (volume.lps_from_index[:3, 3] - tip) @ axis
     near, far = _STRETCH_MM
-    height = (height + far).to(data)
+    moved = mm * ((height + far) / (far - near + mm)).clamp(0, 1)  # of what lands at that height
     along = torch.linalg.solve(volume.lps_from_index[:3, :3], axis)  # voxels per mm
-    shift = (2 * along / (size - 1)).to(data)
-    places = torch.meshgrid(*(2 * n / (len(n) - 1) - 1 for n in (z, y, x)), indexing="ij")
-    here = torch.stack(places[::-1], -1).to(data)
-
-    def stretched(mm: float) -> Volume:
-        moved = mm * (height / (far - near + mm)).clamp(0, 1)  # of what lands at that height
-        source = here - moved[..., None] * shift
-        return volume.with_data(F.grid_sample(data[None, None], source[None], align_corners=True)[0, 0])
-
-    return stretched
+    planes = torch.meshgrid(z, y, x, indexing="ij")[::-1]
+    source = torch.stack([2 * (n - moved * a) / (m - 1) - 1 for n, a, m in zip(planes, along, size, strict=True)], -1)
+    return volume.with_data(F.grid_sample(data[None, None], source[None].to(data), align_corners=True)[0, 0])

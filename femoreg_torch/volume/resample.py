@@ -75,9 +75,11 @@ def sharpened(volume: Volume) -> Volume:
     """
     data = volume.data
     change = torch.zeros_like(data)
-    for axis in range(3):
-        around = F.pad(data.movedim(axis, -1), (1, 1))
-        change += (around[..., 2:] - 2 * around[..., 1:-1] + around[..., :-2]).movedim(-1, axis)
+    for axis, size in enumerate(data.shape):
+        differences = -2 * data
+        differences.narrow(axis, 0, size - 1).add_(data.narrow(axis, 1, size - 1))
+        differences.narrow(axis, 1, size - 1).add_(data.narrow(axis, 0, size - 1))
+        change += differences
     return volume.with_data(data - change / 8)
 
 

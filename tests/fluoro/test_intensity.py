@@ -52,6 +52,7 @@ def test_larger_pixels_average_intensities_as_a_detector_does() -> None:
     fine, coarse = attenuation_image(counts), attenuation_image(downsample(counts, 4))
     offset = (binned(fine, 4) - coarse).mean()  # of the open beam, smoothed over pixels of another size
     torch.testing.assert_close(binned(fine, 4), coarse + offset, atol=1e-5, rtol=0)
+    assert torch.equal(binned(fine, 1), fine)
     torch.testing.assert_close(binned(binned(fine, 2), 2), binned(fine, 4), atol=1e-5, rtol=0)
 
 

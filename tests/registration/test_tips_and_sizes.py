@@ -11,12 +11,12 @@ from torch.nn import functional as F
 
 from femoreg_torch.case import Case, CaseObject, Model, Start
 from femoreg_torch.drr import project
-from femoreg_torch.geometry import CArm, centred_camera
+from femoreg_torch.geometry import CArm, centred_camera, project_points, transform_points
 from femoreg_torch.registration.device_doubts import doubts_about_size, doubts_about_units
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.registration.sizes import device_size
-from femoreg_torch.registration.tips import _parted, _stretching, tip_length
+from femoreg_torch.registration.tips import _near_the_tip, _parted, _stretched, tip_length
 from femoreg_torch.volume import Volume, axis_aligned
 
 TRUTH = true_poses()
@@ -154,6 +154,24 @@ def test_a_tip_that_no_image_shows_is_not_asked(scene: Scene) -> None:
     assert tip_length(scene, TRUTH.with_object("device", pose), "device", "device", (BASE, TIP), PLAIN) is None
 
 
+def test_a_tip_is_looked_at_through_a_window_of_the_same_detector(scene: Scene) -> None:
+    window = _near_the_tip(scene, TRUTH, "device", "device", 1, TIP, float64(0, 0, 1))
+    assert window is not None
+    assert window.there(["anatomy", "device"], range(3)) == [("anatomy", 1), ("device", 1)]
+    whole, part = scene.image("device", 1), window.image("device", 1)
+    assert max(part.shape) < 70
+    tip = transform_points(TRUTH.camera_from("device")[1], TIP[None])
+    (u, v), (column, row) = (project_points(of.carm.camera, tip)[0].round().long() for of in (scene, window))
+    torch.testing.assert_close(part[row - 5 : row + 5, column - 5 : column + 5], whole[v - 5 : v + 5, u - 5 : u + 5])
+    near = window.field("device", 1)
+    assert near is not None
+    assert near[row, column]
+    assert not near[0].any()
+    drawn = project(tool(), TRUTH.camera_from("device")[1][None], window.carm.camera)[0]
+    exact = project(tool(), TRUTH.camera_from("device")[1][None], CARM.camera)[0]
+    assert torch.equal(drawn[row - 5 : row + 5, column - 5 : column + 5], exact[v - 5 : v + 5, u - 5 : u + 5])
+
+
 def test_a_tip_beside_its_model_is_not_asked(scene: Scene) -> None:
     for tip in (float64(0, 0, 400), float64(0, -300, 40)):
         assert tip_length(scene, TRUTH, "device", "device", (BASE, tip), PLAIN) is None
@@ -165,7 +183,7 @@ def test_an_end_is_drawn_out_by_so_much_and_all_else_stays(mm: int) -> None:
     parted = _parted(whole, TIP, axis)
     assert parted is not None
     rest, end = parted
-    drawn_out = _stretching(end, TIP, axis)(mm)
+    drawn_out = _stretched(end, TIP, axis, mm)
     shift = ((end.lps_from_index[:3, 3] - whole.lps_from_index[:3, 3]) / 1.0).round().int().tolist()
     column = drawn_out.data[:, 24 - shift[1], 24 - shift[0]]
     top = end.lps_from_index[2, 3] + 0.5 * (column > 0.05).nonzero().max() * 2
