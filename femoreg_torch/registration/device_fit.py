@@ -32,6 +32,7 @@ from femoreg_torch.registration.shadows import (
     device_of,
     first_guess,
     hardening_of,
+    pairs_of,
     residuals,
     scatter_of,
     solve,
@@ -66,11 +67,11 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
     """Attenuation and pose of a device from images without it and those of `kind` with it; None if none shows it."""
     thing = scene.objects[name].to(CPU)
     share = thing.volume.with_data(_share(thing))
-    borders = None
+    pairs, borders = pairs_of(scene, kind), None
     if thing.materials_known and len(thing.parts) > 1:
         owner, attenuation = _told(thing.parts)
         device = device_of(name, kind, share, owner, len(attenuation), told=attenuation, sharp=thing.sharp)
-        seen = views_of(scene, poses, device)
+        seen = views_of(scene, poses, device, pairs)
         if not seen:
             return None
         fit, evaluations = first_guess(seen, attenuation), 0
@@ -78,7 +79,7 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
         blocks, count = blocks_of(share)
         touching = touching_faces(blocks)
         device = device_of(name, kind, share, blocks, count, touching)
-        seen = views_of(scene, poses, device)
+        seen = views_of(scene, poses, device, pairs)
         if not seen:
             return None
         fit, evaluations = solve(seen, device, first_guess(seen, np.full(count, _START_ATTENUATION)), _ITERATIONS)
@@ -116,9 +117,9 @@ def _scatter_ratio(scene: Scene, poses: Poses, seen: list["View"], fit: Doubles,
         dark = view.paths @ fit[:regions] > -math.log(_DARK)
         if dark.sum() < LEAST_PIXELS:
             continue
-        camera = poses.camera(view.view, LEVEL.camera(scene.carm.camera))
+        camera = poses.camera(view.pair.view, LEVEL.camera(scene.carm.camera))
         names = scene.shown(poses.camera1_from, scene.first_kind)
-        placed = torch.stack([poses.camera_from(name)[view.view] for name in names])[None]
+        placed = torch.stack([poses.camera_from(name)[view.pair.view] for name in names])[None]
         bones = project([scene.objects[name].volume.to(CPU) for name in names], placed, camera, LEVEL.step_mm)
         drawn = bones.flatten().double().numpy()[view.pixels]
         scattered = view.corners @ fit[scatter_of(n, regions)]
@@ -137,7 +138,7 @@ def _settled(
     evaluations = 0
     for number in range(1, _MOST_ROUNDS + 1):
         volume = device.filled(fit[: device.regions])
-        seen = views_of(scene, poses, device, [view.view for view in seen], volume)
+        seen = views_of(scene, poses, device, [view.pair for view in seen], volume)
         fit, used = solve(seen, device, fit, _FEWER)
         evaluations += used
         still = (np.abs(fit[TURN]) < _STILL).all()

@@ -52,16 +52,33 @@ def blocks_of(solid: Volume) -> tuple[Tensor, int]:
 
 def touching_faces(owner: Tensor) -> Indices:
     """Pairs of regions that touch (n, 3): two numbers, and how many faces of voxels they share."""
-    found = []
-    for axis in range(3):
-        size = owner.shape[axis]
-        a, b = owner.narrow(axis, 0, size - 1), owner.narrow(axis, 1, size - 1)
-        touching = (a != b) & (a >= 0) & (b >= 0)
-        found.append(torch.stack([a[touching], b[touching]], 1))
-    count = int(owner.max()) + 1
-    low, high = torch.cat(found).sort(1).values.numpy().T
-    pairs, faces = np.unique(low * count + high, return_counts=True)  # far faster than unique rows
-    return np.column_stack([*np.divmod(pairs, count), faces])
+    of, regions, found = owner.flatten().numpy(), int(owner.max()) + 1, []
+    solid = np.flatnonzero(of >= 0)
+    for axis, size in enumerate(owner.shape):
+        stride = math.prod(owner.shape[axis + 1 :])
+        first = solid[solid // stride % size < size - 1]
+        a, b = of[first], of[first + stride]
+        touching = (a != b) & (b >= 0)
+        a, b = a[touching], b[touching]
+        found.append(np.minimum(a, b) * regions + np.maximum(a, b))
+    pairs, faces = np.unique(np.concatenate(found), return_counts=True)
+    return np.column_stack([*np.divmod(pairs, regions), faces])
+
+
+def filled(share: Volume, owner: Tensor, values: Doubles) -> Volume:
+    """A volume with the values of K regions: that of the region of every voxel, −1 where it is empty, times a share."""
+    inside = share.data.contiguous().numpy()
+    return share.with_data(torch.from_numpy(_filled(inside, owner.contiguous().numpy(), values.astype(np.float32))))
+
+
+@numba.njit(cache=True, nogil=True)
+def _filled(share, owner, values):  # type: ignore[no-untyped-def]
+    """Shares (Z, Y, X) times the value of each voxel's owner; 0 where that is −1."""
+    of, shares, out = owner.reshape(-1), share.reshape(-1), np.zeros(share.size, np.float32)
+    for voxel in range(share.size):
+        if of[voxel] >= 0:
+            out[voxel] = shares[voxel] * values[of[voxel]]
+    return out.reshape(share.shape)
 
 
 def mistakable(material: Indices, attenuation: Doubles, touching: Indices) -> tuple[Indices, Doubles]:
@@ -96,10 +113,10 @@ def mistakes(share: Volume, borders: Borders, attenuation: Doubles) -> tuple[Vol
     chance = np.random.default_rng(0)
     found = []
     for _ in range(_DRAWN_MISTAKES):
-        amount = np.zeros(len(borders.material) + 1)  # the last one is that of empty voxels
+        amount = np.zeros(len(borders.material))
         np.add.at(amount, block, chance.choice([-1.0, 1.0], len(block)) * more)
         amount *= math.sqrt(_TAKEN_FOR_ANOTHER * (1 - _TAKEN_FOR_ANOTHER) / _DRAWN_MISTAKES)
-        found.append(share.with_data(share.data * torch.from_numpy(amount).float()[borders.blocks]))
+        found.append(filled(share, borders.blocks, amount))
     return tuple(found)
 
 

@@ -13,6 +13,7 @@ the metal, so that its darkest places tell S, and lighter ones the attenuation. 
 the CPU, with SciPy, wherever the scene lies.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ from femoreg_torch.cores import on_all_cores
 from femoreg_torch.drr import project_with_jacobian
 from femoreg_torch.geometry import Camera, Poses, transform_points
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.regions import Doubles, Indices, RegionVoxels, region_paths, region_voxels
+from femoreg_torch.registration.regions import Doubles, Indices, RegionVoxels, filled, region_paths, region_voxels
 from femoreg_torch.registration.scene import Kind, Scene
 from femoreg_torch.registration.weights import dilated
 from femoreg_torch.volume import Volume
@@ -70,8 +71,7 @@ class Device:
 
     def filled(self, attenuation: Doubles) -> Volume:
         """Its attenuation, 1/mm, from that of its regions."""
-        of_voxel = torch.from_numpy(np.append(attenuation, 0.0)).float()[self.owner]
-        return self.share.with_data(self.share.data * of_voxel)
+        return filled(self.share, self.owner, attenuation)
 
 
 def device_of(
@@ -89,10 +89,39 @@ def device_of(
 
 
 @dataclass(frozen=True, eq=False)
+class Pair:
+    """The images of one view without and with a device, in pixels of `LEVEL`."""
+
+    view: int
+    without: Doubles  # (H · W,) intensities
+    with_it: Doubles
+    told: Tensor  # (H, W), bool: what both tell, as no shutter shades it and nothing is saturated
+
+
+def pairs_of(scene: Scene, kind: Kind) -> list[Pair]:
+    """The images of the first kind, and those of another kind, of all views that have both."""
+
+    def intensity(k: Kind, view: int) -> Doubles:
+        image = LEVEL.image(scene.image(k, view), scene.carm.camera)
+        return (-image.cpu()).exp().flatten().double().numpy()
+
+    def told(k: Kind, view: int) -> Tensor:
+        stored, field = scene.image(k, view), scene.field(k, view)
+        dark = stored > (stored if field is None else stored[field]).amin()  # a saturated pixel hides shadows
+        return LEVEL.field(dark if field is None else dark & field, scene.carm.camera).cpu()
+
+    def pair(view: int) -> Pair:
+        first = scene.first_kind
+        return Pair(view, intensity(first, view), intensity(kind, view), told(first, view) & told(kind, view))
+
+    return on_all_cores(pair, [view for _, view in scene.there([kind], range(scene.views))], scene.device)
+
+
+@dataclass(frozen=True, eq=False)
 class View:
     """The pixels of one view that the device covers, and those around."""
 
-    view: int
+    pair: Pair
     pixels: Indices  # (N,) of the image of `LEVEL`
     paths: csr_array  # (N, K) mm through each region
     changes: Doubles  # (N, 6) of the path · attenuation by a twist, in units of `TWIST`
@@ -102,43 +131,34 @@ class View:
 
 
 def views_of(
-    scene: Scene, poses: Poses, device: Device, chosen_views: list[int] | None = None, volume: Volume | None = None
+    scene: Scene, poses: Poses, device: Device, pairs: Sequence[Pair], volume: Volume | None = None
 ) -> list[View]:
-    """What views with both images show of a device, by default those that show enough of it.
+    """What pairs of images show of a device, of those that show enough of it.
 
-    With its `volume` they tell how their image changes as the device moves.
+    With its `volume` all pairs, and how their image changes as the device moves.
     """
 
-    def look(view: int) -> View | None:
-        camera = poses.camera(view, LEVEL.camera(scene.carm.camera))
-        pose = poses.camera_from(device.name)[view]
+    def look(pair: Pair) -> View | None:
+        camera = poses.camera(pair.view, LEVEL.camera(scene.carm.camera))
+        pose = poses.camera_from(device.name)[pair.view]
         paths = region_paths(device.voxels, pose, camera)
         covered = torch.from_numpy(paths.sum(1)).reshape(camera.shape) > _LEAST_PATH_MM
         if volume is not None:
             covered = dilated(covered, _AROUND_MM, camera)
-        intensities = []
-        for k in (scene.first_kind, device.kind):
-            stored = scene.image(k, view)
-            image = LEVEL.image(stored, scene.carm.camera)
-            intensities.append((-image.cpu()).exp().flatten().double().numpy())
-            field = scene.field(k, view)
-            told = stored > (stored if field is None else stored[field]).amin()  # a saturated pixel hides shadows
-            covered &= LEVEL.field(told if field is None else told & field, scene.carm.camera).cpu()
-        chosen = np.flatnonzero(covered.flatten().numpy())
+        chosen = np.flatnonzero((covered & pair.told).flatten().numpy())
         changes = np.zeros((len(chosen), 6))
         if volume is not None:
             centre = transform_points(pose, scene.objects[device.name].reference_point[None])[0]
             _, jacobian = project_with_jacobian(volume, pose[None], camera, centre, LEVEL.step_mm)
-            turn = torch.block_diag(*[poses.camera_from_camera1[view][:3, :3]] * 2)  # twists of camera 1 to this one's
+            # twists of camera 1 to this one's
+            turn = torch.block_diag(*[poses.camera_from_camera1[pair.view][:3, :3]] * 2)
             changes = (jacobian[0].flatten(0, 1)[chosen].double() @ turn).numpy() * TWIST
-        if chosen_views is None and len(chosen) < LEAST_PIXELS:
+        elif len(chosen) < LEAST_PIXELS:
             return None
-        without, with_it = (values[chosen] for values in intensities)
-        return View(view, chosen, paths[chosen], changes, without, with_it, _corners(chosen, camera))
+        without, with_it = pair.without[chosen], pair.with_it[chosen]
+        return View(pair, chosen, paths[chosen], changes, without, with_it, _corners(chosen, camera))
 
-    there = [view for _, view in scene.there([device.kind], range(scene.views))]
-    asked = [view for view in there if chosen_views is None or view in chosen_views]
-    return [view for view in on_all_cores(look, asked) if view is not None]
+    return [view for view in on_all_cores(look, pairs, scene.device) if view is not None]
 
 
 def first_guess(seen: list[View], attenuation: Doubles) -> Doubles:
@@ -171,6 +191,7 @@ def solve(seen: list[View], device: Device, begin: Doubles, iterations: int) -> 
     highest = np.concatenate([np.full(regions, _MOST_ATTENUATION), np.inf * darkest, exposures, [hardest], turns])
     lowest = np.concatenate([np.zeros(regions + len(darkest)), -exposures, [softest], -turns])
     count = max(1, sum(len(view.with_it) for view in seen))
+    by_region = [view.paths.T for view in seen]
 
     def cost(y: Doubles) -> tuple[float, Doubles]:
         x = y * unit
@@ -180,7 +201,7 @@ def solve(seen: list[View], device: Device, begin: Doubles, iterations: int) -> 
             root = np.sqrt(1 + (residual / _MISFIT) ** 2)
             value += (root - 1).sum() / count
             push = residual / root / (_MISFIT**2 * count)
-            slope[:regions] += view.paths.T @ (push * by_path)
+            slope[:regions] += by_region[n] @ (push * by_path)
             slope[scatter_of(n, regions)] += (push * by_scatter) @ view.corners
             slope[regions + _CORNERS * views + n] -= push.sum()
             slope[_AT_HARDENING] += push @ by_hardening

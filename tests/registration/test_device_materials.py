@@ -15,6 +15,7 @@ from femoreg_torch.registration.calibration import Calibration
 from femoreg_torch.registration.device_fit import fit_device
 from femoreg_torch.registration.regions import (
     blocks_of,
+    filled,
     materials,
     mistakable,
     region_paths,
@@ -22,7 +23,7 @@ from femoreg_torch.registration.regions import (
     touching_faces,
 )
 from femoreg_torch.registration.scene import RigidObject, Scene
-from femoreg_torch.registration.shadows import device_of, first_guess, hardening_of, residuals, views_of
+from femoreg_torch.registration.shadows import device_of, first_guess, hardening_of, pairs_of, residuals, views_of
 from femoreg_torch.volume import Volume, axis_aligned, voxelise_mesh
 
 CARM = CArm(centred_camera(1000.0, (1.5, 1.5), (160, 160)), (0.0, 0.0, 600.0), (0.0, 1.0, 0.0))
@@ -148,7 +149,7 @@ def test_residuals_have_the_derivatives_that_they_say(mixed: Scene) -> None:
     share = share.with_data(share.data / share.data.max())
     owner = torch.where(share.data > 0, 0, -1)
     device = device_of("device", "device", share, owner, 1)
-    seen = views_of(mixed, poses(), device)[:1]
+    seen = views_of(mixed, poses(), device, pairs_of(mixed, "device"))[:1]
     x = first_guess(seen, np.array([0.3]))
     value, by_path, by_scatter, by_hardening = residuals(x, seen, 0, 1)
     step = 1e-5
@@ -259,6 +260,24 @@ def test_coarse_and_tiny_solids_have_blocks() -> None:
     blocks, count = blocks_of(Volume(torch.ones(2, 2, 2), axis_aligned((1.0, 1.0, 1.0), (0.0, 0.0, 0.0))))
     assert count == 1
     assert len(touching_faces(blocks)) == 0
+
+
+def test_faces_and_fillings_of_regions_are_those_of_their_voxels() -> None:
+    generator = torch.Generator().manual_seed(3)
+    owner = torch.randint(-1, 4, (5, 6, 7), generator=generator)
+    faces: dict[tuple[int, int], int] = {}
+    for z, y, x in np.ndindex(5, 6, 7):
+        for other in ((z + 1, y, x), (z, y + 1, x), (z, y, x + 1)):
+            if all(n < size for n, size in zip(other, owner.shape, strict=True)):
+                one, two = sorted((int(owner[z, y, x]), int(owner[other])))
+                if 0 <= one < two:
+                    faces[one, two] = faces.get((one, two), 0) + 1
+    assert touching_faces(owner).tolist() == [[*pair, faces[pair]] for pair in sorted(faces)]
+
+    share = Volume(torch.rand(5, 6, 7, generator=generator), axis_aligned((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)))
+    values = np.array([0.5, -1.0, 0.0, 3.0])
+    of_voxel = torch.tensor([*values, 0.0]).float()[owner]
+    assert torch.equal(filled(share, owner, values).data, share.data * of_voxel)
 
 
 def test_few_materials() -> None:
