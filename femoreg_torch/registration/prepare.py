@@ -67,24 +67,23 @@ def prepare_scene(case: Case) -> Scene:
     objects: dict[str, RigidObject] = {}
     tissue = outline = None
     with ThreadPoolExecutor(max_workers=1) as beside:  # images and models are read while the CT is
-        reading = beside.submit(read_images, case)
+        reading = beside.submit(_read_with_saturated, case)
         making = {
             thing.name: beside.submit(model_attenuation, thing.model) for thing in case.objects.values() if thing.model
         }
         if from_ct:
             ct, bones = read_bones(case)
+            outlining = beside.submit(outline_of, bones, case.anatomy)
             check_inside(case.landmarks, ct)
             told_of_ct = (*bones.notes, *_check_anatomy(case, ct, bones))
             _check_path(case, ct)
             soft = resample_isotropic(ct.with_data(ct.data.clamp_max(SOFT_HU)), TISSUE_SPACING_MM)
             tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
-            outline = outline_of(bones, case.anatomy)
-        images, fields, told = reading.result()
-        bright = _saturated(images, fields)
-        told = (*told, *_told_saturated(bright))
+        images, fields, bright, told = reading.result()
         if from_ct:
             told = (*told_of_ct, *told)
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
+            outline = outlining.result()
         made = {name: model.result() for name, model in making.items()}
     for name, volumes in made.items():
         thing = case.objects[name]
@@ -242,6 +241,13 @@ def read_images(case: Case) -> tuple[ByKind, ByKind, tuple[str, ...]]:
             told.append(_told(case, kind, without))
     _check_different(case, images)
     return images, fields, tuple(told)
+
+
+def _read_with_saturated(case: Case) -> tuple[ByKind, ByKind, ByKind, tuple[str, ...]]:
+    """As `read_images`, with the saturated pixels."""
+    images, fields, told = read_images(case)
+    bright = _saturated(images, fields)
+    return images, fields, bright, (*told, *_told_saturated(bright))
 
 
 def _saturated(images: ByKind, fields: ByKind) -> ByKind:
