@@ -166,7 +166,11 @@ class ImageCosts:
         for target, (poses, _) in zip(moving, placed, strict=True):
             for name, pose in zip(target.moving, poses, strict=True):
                 wanted.setdefault((target.view, name), (target, pose))
-        drawn = on_all_cores(lambda each: self._image_and_jacobian(delta, each), list(wanted.items()), self._device)
+        jobs = list(wanted.items())
+        if len(jobs) <= 2:  # of unlike sizes, so that one core would wait; a kernel by itself uses all of them
+            drawn = [self._image_and_jacobian(delta, each) for each in jobs]
+        else:
+            drawn = on_all_cores(lambda each: self._image_and_jacobian(delta, each), jobs, self._device)
         seen = dict(zip(wanted, drawn, strict=True))
         about = [
             partial(self._changes, target, delta, poses, seen, unsure)
