@@ -107,14 +107,13 @@ def _quantile(values: Tensor, share: float) -> float:
 
 def _grown(mask: Tensor, by: int) -> Tensor:
     """A mask (D, H, W), bool, grown by some voxels along all axes."""
-    grown = mask.clone()
-    for axis in range(3):
-        before = grown.clone()
-        for shift in range(1, min(by, mask.shape[axis] - 1) + 1):
-            left = mask.shape[axis] - shift
-            grown.narrow(axis, shift, left).logical_or_(before.narrow(axis, 0, left))
-            grown.narrow(axis, 0, left).logical_or_(before.narrow(axis, shift, left))
-    return grown
+    for axis, size in enumerate(mask.shape):
+        grown = mask.clone()
+        for n in range(1, min(by, size - 1) + 1):
+            grown.narrow(axis, n, size - n).logical_or_(mask.narrow(axis, 0, size - n))
+            grown.narrow(axis, 0, size - n).logical_or_(mask.narrow(axis, n, size - n))
+        mask = grown
+    return mask
 
 
 def _correlation(image: np.ndarray, kernel: np.ndarray, reach: Sequence[int]) -> np.ndarray:
