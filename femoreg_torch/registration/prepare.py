@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import Anatomy
-from femoreg_torch.case import Case, CaseObject
+from femoreg_torch.case import Case, CaseObject, Model
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import (
     Circle,
@@ -31,8 +31,8 @@ from femoreg_torch.fluoro import (
     settled_intensity,
     without_penumbra,
 )
-from femoreg_torch.registration.models import model_attenuation
-from femoreg_torch.registration.roundness import round_axis
+from femoreg_torch.registration.models import ModelVolumes, model_attenuation
+from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.registration.silhouette import outline_of
 from femoreg_torch.volume import (
@@ -69,7 +69,9 @@ def prepare_scene(case: Case) -> Scene:
     with ThreadPoolExecutor(max_workers=1) as beside:  # images and models are read while the CT is
         reading = beside.submit(_read_with_saturated, case)
         making = {
-            thing.name: beside.submit(model_attenuation, thing.model) for thing in case.objects.values() if thing.model
+            thing.name: beside.submit(_read_model, case, thing, thing.model)
+            for thing in case.objects.values()
+            if thing.model
         }
         if from_ct:
             ct, bones = read_bones(case)
@@ -85,17 +87,16 @@ def prepare_scene(case: Case) -> Scene:
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
             outline = outlining.result()
         made = {name: model.result() for name, model in making.items()}
-    for name, volumes in made.items():
+    for name, (volumes, axis) in made.items():
         thing = case.objects[name]
         assert thing.model is not None
-        _check_points(case, thing, volumes.volume)
         objects[name] = RigidObject(
             volumes.volume,
             volumes.volume.centre() if thing.reference is None else thing.reference,
             thing.images or tuple(images),
             thing.start,
             parts=volumes.parts,
-            axis=round_axis(volumes.volume, volumes.parts, _named_points(thing).values()),
+            axis=axis,
             materials_known=thing.model.materials_known,
             sharp=bool(thing.model.solids),
         )
@@ -138,6 +139,13 @@ def _check_path(case: Case, ct: Volume) -> None:
 def _named_points(thing: CaseObject) -> dict[str, Tensor]:
     """All points (3,) of an object that have a name, its reference too if it is given."""
     return thing.points if thing.reference is None else {**thing.points, "reference": thing.reference}
+
+
+def _read_model(case: Case, thing: CaseObject, model: Model) -> tuple[ModelVolumes, Axis | None]:
+    """An object's model as volumes, and its axis if it is round. Raises `InputError` for what does not fit."""
+    volumes = model_attenuation(model)
+    _check_points(case, thing, volumes.volume)
+    return volumes, round_axis(volumes.volume, volumes.parts, _named_points(thing).values())
 
 
 def _check_points(case: Case, thing: CaseObject, volume: Volume) -> None:
