@@ -20,7 +20,7 @@ _MOST_WITHOUT_SHADOW = 0.08  # share of a model's volume
 _AS_GOOD_ELSEWHERE = 0.37
 # Of a tip beside that of its model, mm, and what a model of that length gains of the similarity near the tip.
 # Seen of 38 right devices of two foreign simulators: at most 0.54 mm and 0.002. Of nine tips 2 to 4 mm off, eight were
-# told: five by 1.1 to 3.3 mm and 0.018 to 0.22, and three, whose end the estimate had emptied, by the model as told
+# told: five by 1.1 to 3.3 mm and 0.016 to 0.22, and three, whose end the estimate had emptied, by the model as told
 # alone, which was 0.8 to 1.5 mm too long. As told, right ones were at most 0.4 mm too long, but 1.9 mm too short.
 _MOST_OFF_TIP_MM, _LEAST_GAIN_OF_TIP = 0.8, 0.01
 # Seen of the same 38: at most 0.9 %, with no gain. Of five models 2 and 3 % off: 1.9 to 3.2 %, and 0.0007 to 0.002.
