@@ -158,7 +158,7 @@ def views_of(
         without, with_it = pair.without[chosen], pair.with_it[chosen]
         return View(pair, chosen, paths[chosen], changes, without, with_it, _corners(chosen, camera))
 
-    return [view for view in on_all_cores(look, pairs, scene.device) if view is not None]
+    return [view for view in on_all_cores(look, pairs) if view is not None]
 
 
 def first_guess(seen: list[View], attenuation: Doubles) -> Doubles:
