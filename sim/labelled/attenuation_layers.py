@@ -15,12 +15,13 @@ from femoreg_torch.volume import (
     resample_isotropic,
     structure_attenuation,
 )
+from sim.labelled.prolonged import prolonged
 
 _SOFT_HU = 50.0  # bone is the attenuation above this one
 _TISSUE_MM = 3.0
 _RIM_MM = 2.0  # partial-volume rim of a bone outside its label
 _FIELD_STEP = 4  # voxels between the points where a displacement is computed; linear between them
-_BEYOND = 30  # tissue voxels repeated above and below the scan, so that the patient does not end in mid-air
+_BEYOND_MM = 100.0  # of the first and the last slice repeated below and above the scan: a cut femur goes on
 
 Displacement = Callable[[Tensor], Tensor]  # points (..., 3) in LPS mm to shifts (..., 3) in mm
 
@@ -38,8 +39,10 @@ class Layers:
 def split_layers(ct: Volume, labels: Volume, landmarks: Mapping[str, Tensor], spacing_mm: float = 1.5) -> Layers:
     """Layers of a CT in HU and its label map (ids of the table `femoreg`) on the same grid.
 
-    The bones are on voxels of `spacing_mm`. Raises `InputError` if one of them has nothing above soft tissue.
+    The patient goes on beyond the CT's ends as it is there. The bones are on voxels of `spacing_mm`. Raises
+    `InputError` if one of them has nothing above soft tissue.
     """
+    ct, labels = prolonged(ct, _BEYOND_MM), prolonged(labels, _BEYOND_MM)
     rim = max(1, round(_RIM_MM / min(ct.spacing_mm)))
     tissue = hu_to_attenuation(ct.data, -1000.0)
     bones, masks = {}, {}
@@ -54,7 +57,7 @@ def split_layers(ct: Volume, labels: Volume, landmarks: Mapping[str, Tensor], sp
         masks[name] = resample_isotropic(bone.with_data(inside[z, y, x].to(torch.float32)), spacing_mm)
     points = torch.stack([landmarks[name] for name in HIP.landmark_names])
     coarse = resample_isotropic(ct.with_data(tissue), _TISSUE_MM)
-    return Layers(_padded(coarse, (0, 0, _BEYOND), "replicate"), bones, masks, points)
+    return Layers(coarse, bones, masks, points)
 
 
 def _slices(part: Volume, whole: Volume) -> tuple[slice, slice, slice]:
@@ -114,9 +117,9 @@ def _warped(volumes: Sequence[Volume], displacement: Displacement) -> list[Volum
     return [volume.with_data(moved) for volume, moved in zip(volumes, data, strict=True)]
 
 
-def _padded(volume: Volume, margin_xyz: tuple[int, int, int], mode: str = "constant") -> Volume:
-    """The volume with so many voxels more on both sides of each axis, zero or (`replicate`) as at its face."""
+def _padded(volume: Volume, margin_xyz: tuple[int, int, int]) -> Volume:
+    """The volume with so many voxels of zero more on both sides of each axis."""
     x, y, z = margin_xyz
     affine = volume.lps_from_index.clone()
     affine[:3, 3] -= affine[:3, :3] @ torch.tensor(margin_xyz, dtype=torch.float64)
-    return Volume(F.pad(volume.data[None, None], (x, x, y, y, z, z), mode=mode)[0, 0], affine)
+    return Volume(F.pad(volume.data[None, None], (x, x, y, y, z, z))[0, 0], affine)

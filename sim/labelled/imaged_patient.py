@@ -10,6 +10,7 @@ from torch import Tensor
 from femoreg_torch.anatomy import HIP, label_table
 from femoreg_torch.volume import Volume, resample_isotropic
 from sim.labelled.patient_folders import find_patient, hip_labels, read_patient
+from sim.labelled.prolonged import prolonged
 from sim.labelled.view_poses import FEMORAL_HEADS
 from sim.physics.tissue_densities import separate
 
@@ -33,7 +34,7 @@ def prepare_patient(ct: Volume, labels: Volume, landmarks: Mapping[str, Tensor])
 
     Raises `InputError` if the label map lacks a femur.
     """
-    ct, labels = _prolonged(ct), _prolonged(labels)
+    ct, labels = prolonged(ct, _BEYOND_MM), prolonged(labels, _BEYOND_MM)
     ids = label_table("femoreg")
     filled, bone, femora, _ = separate(ct, labels, [ids[femur] for femur in FEMORAL_HEADS])
     masks = {}
@@ -49,13 +50,3 @@ def read_imaged_patient(folder: Path) -> ImagedPatient:
     """The patient of a folder, see `sim.labelled.patient_folders`. Raises `InputError`."""
     patient = read_patient(find_patient(folder))
     return prepare_patient(patient.ct, hip_labels(patient.bones), patient.landmarks)
-
-
-def _prolonged(volume: Volume) -> Volume:
-    """The volume with its first and last slice repeated: a patient does not end where the CT ends."""
-    slices = round(_BEYOND_MM / volume.spacing_mm[2])
-    data = volume.data
-    data = torch.cat([data[:1].expand(slices, -1, -1), data, data[-1:].expand(slices, -1, -1)])
-    affine = volume.lps_from_index.clone()
-    affine[:3, 3] -= slices * affine[:3, 2]
-    return Volume(data, affine)

@@ -33,7 +33,8 @@ _SYMPHYSIS_GAP_MM = 4.0  # 3 to 5 mm in adults (Becker et al., "The adult human 
 _ABOVE_MM = 250.0  # spine kept above the femoral heads
 _END_MM = 9.0  # a bone that the map cuts off goes on by so much, so that the scan cuts it and no cap is seen
 _SHAFT_MM = -80.0  # lower than this against the head's centre, a femur is shaft
-_LEAST_SHAFT_MM = 10.0  # of the shaft that are needed to find its axis
+_LEAST_SHAFT_MM = 10.0  # of the shaft that are needed to find its axis; with less it counts as upright
+_LEAST_FEMUR_MM = 70.0  # below the head's centre: with less the femur ends within its trochanters
 
 
 def skeleton_from_labels(labels: Volume, table: LabelTable) -> tuple[Skeleton, Points, float]:
@@ -203,19 +204,25 @@ def _half(hips: Field, plane: Points, sign: int) -> Field:
 def _femur_axes(femur: Field, head: Points, sign: int) -> tuple[Points, Points]:
     """`lps_from_femur` (3, 3), whose third column runs up the shaft, and the neck's direction (3,) from the head."""
     points = np.argwhere(femur.values < 0) * femur.step + femur.lo - head
-    shaft = points[points[:, 2] < _SHAFT_MM]
-    if len(shaft) == 0 or np.ptp(shaft[:, 2]) < _LEAST_SHAFT_MM:
+    if -points[:, 2].min() < _LEAST_FEMUR_MM:
         raise InputError(
             f"label map: the femora end {-points[:, 2].min():.0f} mm below the centres of their heads; "
-            f"{_LEAST_SHAFT_MM - _SHAFT_MM:.0f} mm are needed."
+            f"{_LEAST_FEMUR_MM:.0f} mm are needed."
         )
-    levels = np.unique(np.round(shaft[:, 2], 3))
-    middles = np.array([shaft[np.isclose(shaft[:, 2], level)].mean(0) for level in levels])
-    up = np.linalg.svd(middles - middles.mean(0), full_matrices=False)[2][0]
-    up *= np.sign(up[2])
+    up = _shaft_axis(points[points[:, 2] < _SHAFT_MM])
     distance = np.linalg.norm(points, axis=1)
     neck = points[(distance > 25) & (distance < 40)].mean(0)
     neck /= np.linalg.norm(neck)
     left = neck * sign - up * (up @ neck) * sign
     left /= np.linalg.norm(left)
     return np.stack([left, np.cross(up, left), up], 1), neck
+
+
+def _shaft_axis(shaft: Points) -> Points:
+    """Unit vector (3,) up a shaft of points (N, 3); straight up if there is too little of it."""
+    if len(shaft) == 0 or np.ptp(shaft[:, 2]) < _LEAST_SHAFT_MM:
+        return np.array([0.0, 0.0, 1.0])
+    levels = np.unique(np.round(shaft[:, 2], 3))
+    middles = np.array([shaft[np.isclose(shaft[:, 2], level)].mean(0) for level in levels])
+    up: Points = np.linalg.svd(middles - middles.mean(0), full_matrices=False)[2][0]
+    return up * np.sign(up[2])

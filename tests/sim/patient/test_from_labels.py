@@ -98,6 +98,28 @@ def test_heads_shafts_and_landmarks(truth: Skeleton, skeleton: tuple[Skeleton, N
         assert np.linalg.det(found.lps_from_femur[side]) > 0.99
 
 
+def below(labels: Volume, cut_mm: float, skeleton: tuple[Skeleton, NDArray[np.float64], float]) -> Volume:
+    """The map, empty from `cut_mm` below the middle of the heads downwards."""
+    head = skeleton[1][2]
+    data = labels.data.clone()
+    data[: round((head - cut_mm - float(labels.lps_from_index[2, 3])) / SPACING[2])] = 0
+    return labels.with_data(data)
+
+
+def test_femora_cut_below_the_trochanters_count_as_upright(
+    labels: Volume, skeleton: tuple[Skeleton, NDArray[np.float64], float]
+) -> None:
+    short, _, bottom_mm = skeleton_from_labels(below(labels, 74.0, skeleton), TABLE)
+    assert bottom_mm == pytest.approx(-74, abs=3)
+    for side in ("left", "right"):
+        axes = short.lps_from_femur[side]
+        np.testing.assert_allclose(axes[:, 2], [0, 0, 1])
+        np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-9)
+        assert axes[:, 0] @ skeleton[0].lps_from_femur[side][:, 0] > np.cos(np.radians(15))
+    with pytest.raises(InputError, match=r"end \d+ mm below the centres of their heads; 70 mm are needed"):
+        skeleton_from_labels(below(labels, 45.0, skeleton), TABLE)
+
+
 def test_the_patient_around_the_bones(labels: Volume, points: dict[str, NDArray[np.float64]], tmp_path: Path) -> None:
     write_volume(tmp_path / "map.nii.gz", labels)
     write_label_patient(tmp_path / "map.nii.gz", TABLE, tmp_path / "case", seed=2, spacing_mm=2.0)
