@@ -26,9 +26,10 @@ from femoreg_torch.registration.handedness import handedness
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.misfits import misfits
 from femoreg_torch.registration.motion import MotionBetween
+from femoreg_torch.registration.objective import ImageCosts
 from femoreg_torch.registration.orbit import orbits
 from femoreg_torch.registration.quality import Limits, shift_px
-from femoreg_torch.registration.rigidity import CUTS, Bend, bend
+from femoreg_torch.registration.rigidity import CUTS, Bend, bend, images_of
 from femoreg_torch.registration.scene import Scene
 
 # A mobile C-arm that turns about its orbit comes back within some mm and degrees (the paper draws 2 mm and 1°), and
@@ -290,8 +291,9 @@ def doubts_about_handedness(scene: Scene, poses: Poses, imaging: Imaging) -> tup
 def doubts_about_rigidity(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
     """Objects whose ends do not lie as their models have them, in words; the anchor is asked where it is alone."""
     names = [name for name in poses.camera1_from if name != scene.anchor] or [scene.anchor]
+    images = {name: images_of(scene, poses, name, imaging) for name in names}
     asked = [(name, share) for name in names for share in CUTS]
-    every = on_all_cores(lambda each: _ends_apart(scene, poses, *each, imaging), asked, scene.device)
+    every = on_all_cores(lambda each: _ends_apart(scene, poses, *each, images[each[0]]), asked, scene.device)
     told = []
     for name in names:
         bent = [found for (of, _), found in zip(asked, every, strict=True) if of == name and found is not None]
@@ -305,10 +307,12 @@ def doubts_about_rigidity(scene: Scene, poses: Poses, imaging: Imaging) -> tuple
     return tuple(told)
 
 
-def _ends_apart(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging) -> Bend | None:
+def _ends_apart(
+    scene: Scene, poses: Poses, name: str, share: float, images: tuple[ImageCosts, ...] | None
+) -> Bend | None:
     """How the ends of an object lie apart, if they do, and still do without turns that no image tells."""
     for only_told in (False, True):
-        found = bend(scene, poses, name, share, imaging, only_told)
+        found = bend(scene, poses, name, share, images, only_told)
         if found is None or not _is_bent(found, bool(scene.objects[name].parts)):
             return None
     return found

@@ -1,6 +1,6 @@
 """The objective of a stage: mean similarity cost of a batch of candidate deltas (paper, equations 1, 3, 4)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -143,6 +143,17 @@ class ImageCosts:
     def with_object(self, name: str, thing: RigidObject) -> "ImageCosts":
         """The same images with another object in the place of one that moves."""
         return replace(self, objects=self.objects | {name: thing})
+
+    def in_parts(
+        self, name: str, parts: Mapping[str, RigidObject], poses: Poses, bodies: tuple[Body, ...]
+    ) -> "ImageCosts":
+        """The same images with parts of one that moves in its place, which lie at `poses` and are moved by `bodies`."""
+
+        def moving(names: tuple[str, ...]) -> tuple[str, ...]:
+            return tuple(each for one in names for each in (parts if one == name else (one,)))
+
+        targets = tuple(replace(target, moving=moving(target.moving)) for target in self.targets)
+        return replace(self, objects=self.objects | dict(parts), poses=poses, bodies=bodies, targets=targets)
 
     def without_what_moves(self) -> Tensor:
         """Costs (images,) of what stands still alone."""

@@ -72,27 +72,25 @@ class _Ends:
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """An object cut in two, in a scene that has both ends, and the images that are asked."""
+    """An object cut in two, and what images say of where its ends lie."""
 
-    scene: Scene
     names: tuple[str, str]  # of the ends
     ends: _Ends
-    shown: tuple[str, ...]  # all but the object itself
-    images: list[tuple[Kind, int]]
-    imaging: Imaging
+    whole: tuple[ImageCosts, ...]  # of the object in one piece, by level
 
-    def asked(self, poses: Poses, level: Level) -> tuple[tuple[Body, ...], ImageCosts]:
-        """The ends as bodies, and what images at a level say of their motions. Raises `InputError` if nothing."""
+    def asked(self, poses: Poses, number: int) -> tuple[tuple[Body, ...], ImageCosts]:
+        """The ends as bodies, and what images at the level of this number say of their motions."""
+        level = _LEVELS[number]
         bodies = tuple(_body(poses, *end) for end in zip(self.names, self.ends.points, strict=True))
-        render = [*self.shown, *self.names]
-        return bodies, image_costs(
-            self.scene, poses, bodies, render, self.images, level, _SIMILARITY, imaging=self.imaging
-        )
+        parts = [replace(end, volume=level.volume(end.volume, sharp=end.sharp)) for end in self.ends.objects]
+        whole = self.whole[number]
+        (name,) = {of for body in whole.bodies for of in body.objects}
+        return bodies, whole.in_parts(name, dict(zip(self.names, parts, strict=True)), poses, bodies)
 
     def fitted(self, poses: Poses, ways: Tensor) -> "_Fitted":
         """Where the ends fit, from their poses, as far as they go along some ways (12, n)."""
-        for level in _LEVELS:
-            bodies, costs = self.asked(poses, level)
+        for number in range(len(_LEVELS)):
+            bodies, costs = self.asked(poses, number)
             objective = _along(stage_objective(costs, bodies, None), ways)
             delta = ways @ _OPTIMISER.minimise(objective, ways.shape[1], seed=0).delta
             poses = moved(poses, bodies, delta)
@@ -104,7 +102,7 @@ class _Cut:
         """The motions (12, n) of the ends that images tell, see `_told`."""
         points = zip(self.names, self.ends.points, strict=True)
         axes = [long_axis(transform_points(poses.camera1_from[name], of)) for name, of in points]
-        return _told(*self.asked(poses, _LEVELS[-1]), axes)
+        return _told(*self.asked(poses, -1), axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,24 +115,40 @@ class _Fitted:
     spread: Tensor  # (12, 12): covariance of the last motion
 
 
-def bend(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging, only_told: bool = False) -> Bend | None:
-    """Of an object at its pose, cut at a share of its length as far as it is seen; all else stays where it is.
+def images_of(scene: Scene, poses: Poses, name: str, imaging: Imaging) -> tuple[ImageCosts, ...] | None:
+    """Costs of an object's motion in the images that show it, at each level, for `bend`; all else stays where it is.
+
+    None where nothing of an image is exposed.
+    """
+    thing = replace(scene.objects[name], unsure=())
+    scene = replace(scene, objects=scene.objects | {name: thing})
+    body = _body(poses, name, thing.reference_point[None])
+    render, images = list(poses.camera1_from), _shown_in(scene, name)
+    try:
+        return tuple(
+            image_costs(scene, poses, (body,), render, images, level, _SIMILARITY, imaging=imaging) for level in _LEVELS
+        )
+    except InputError:  # what is saturated leaves nothing to compare
+        return None
+
+
+def bend(
+    scene: Scene, poses: Poses, name: str, share: float, images: tuple[ImageCosts, ...] | None, only_told: bool = False
+) -> Bend | None:
+    """Of an object at its pose, cut at a share of its length as far as it is seen; `images` are those of `images_of`.
 
     With `only_told`, an end does not turn about its long axis where no image tells that turn.
 
     None where the images show too little of one end, or nothing of them is exposed.
     """
-    cut = _cut(scene, poses, name, share, imaging)
-    if cut is None:
+    ends = _ends(scene, poses, name, share, _shown_in(scene, name))
+    if ends is None or images is None:
         return None
+    cut = _Cut((f"{name}, one end", f"{name}, the other"), ends, images)
     uncut = poses
     for each in cut.names:
         uncut = uncut.with_object(each, poses.camera1_from[name])
-    try:
-        for level in _LEVELS:
-            costs = cut.asked(uncut, level)[1]
-    except InputError:  # what is saturated leaves nothing to compare
-        return None
+    _, costs = cut.asked(uncut, -1)
     found = cut.fitted(uncut, torch.eye(len(costs.still), dtype=torch.float64))
     if only_told:
         found = cut.fitted(uncut, cut.told(found.poses))
@@ -193,17 +207,12 @@ def _at(point: Tensor, body: Body) -> Tensor:
     return response * body.scale * torch.tensor([180 / torch.pi] * 3 + [1.0] * 3, dtype=torch.float64)
 
 
-def _cut(scene: Scene, poses: Poses, name: str, share: float, imaging: Imaging) -> _Cut | None:
+def _shown_in(scene: Scene, name: str) -> list[tuple[Kind, int]]:
+    """The first image, (kind, view), of every view that shows an object."""
     images: list[tuple[Kind, int]] = []
     for view in range(scene.views):
         images += scene.there(scene.objects[name].shown_in, (view,))[:1]
-    ends = _ends(scene, poses, name, share, images)
-    if ends is None:
-        return None
-    names = f"{name}, one end", f"{name}, the other"
-    scene = replace(scene, objects=scene.objects | dict(zip(names, ends.objects, strict=True)))
-    shown = tuple(other for other in poses.camera1_from if other != name)
-    return _Cut(scene, names, ends, shown, images, imaging)
+    return images
 
 
 def _ends(scene: Scene, poses: Poses, name: str, share: float, images: Sequence[tuple[Kind, int]]) -> _Ends | None:

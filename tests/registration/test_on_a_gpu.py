@@ -43,7 +43,7 @@ from femoreg_torch.registration.handedness import handedness
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.objective import image_costs, stage_objective
 from femoreg_torch.registration.quality import Limits, assess, final_covariance
-from femoreg_torch.registration.rigidity import bend
+from femoreg_torch.registration.rigidity import bend, images_of
 from femoreg_torch.registration.scene import Body, Moving, Outline, intrinsics_of, reference_point_in_view
 from femoreg_torch.registration.silhouette import refine_by_silhouette
 from femoreg_torch.registration.stage import run_stage
@@ -186,7 +186,7 @@ def test_a_plan_ends_where_it_ends_on_the_cpu(scene: Scene, gpu: PretendedGpu | 
     fits = [handedness(one, poses, "pelvis", PLAIN) for one in scenes]
     assert fits[1].similarity == pytest.approx(fits[0].similarity, abs=1e-4)
     assert fits[1].mirrored == pytest.approx(fits[0].mirrored, abs=0.01)
-    bent = [bend(one, poses, "femur", 0.5, PLAIN) for one in scenes]
+    bent = [bend(one, poses, "femur", 0.5, images_of(one, poses, "femur", PLAIN)) for one in scenes]
     assert bent[0] is not None
     assert bent[1] is not None
     assert bent[1].apart_mm == pytest.approx(bent[0].apart_mm, abs=0.02)

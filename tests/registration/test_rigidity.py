@@ -13,7 +13,7 @@ from femoreg_torch.geometry import Poses, exp_so3, load_carm, rigid
 from femoreg_torch.registration import Scene, doubts
 from femoreg_torch.registration.doubts import doubts_about_rigidity
 from femoreg_torch.registration.imaging import PLAIN
-from femoreg_torch.registration.rigidity import CUTS, Bend, bend
+from femoreg_torch.registration.rigidity import CUTS, Bend, bend, images_of
 from femoreg_torch.registration.scene import RigidObject
 from femoreg_torch.volume import Volume, axis_aligned
 
@@ -25,10 +25,14 @@ def scene() -> Scene:
     return make_scene(TRUTH)
 
 
+def bent(scene: Scene, poses: Poses, name: str, share: float, only_told: bool = False) -> Bend | None:
+    return bend(scene, poses, name, share, images_of(scene, poses, name, PLAIN), only_told)
+
+
 def test_what_is_rigid_is_not_doubted(scene: Scene) -> None:
     for name in REFERENCE_POINTS:
         for share in CUTS:
-            found = bend(scene, TRUTH, name, share, PLAIN)
+            found = bent(scene, TRUTH, name, share)
             assert found is not None
             assert found.apart_mm < 0.4, (name, share)
     assert doubts_about_rigidity(scene, TRUTH, PLAIN) == ()
@@ -37,7 +41,7 @@ def test_what_is_rigid_is_not_doubted(scene: Scene) -> None:
 @pytest.mark.parametrize(("name", "axis"), [("device", 2), ("femur", 0)])
 def test_a_broken_object_is_doubted_by_as_much_as_it_is_bent(scene: Scene, name: str, axis: int) -> None:
     broken = replace(scene, images=images_of_broken(name, axis, TRUTH, KINDS))
-    found = bend(broken, TRUTH, name, 0.5, PLAIN)
+    found = bent(broken, TRUTH, name, 0.5)
     assert found is not None
     assert found.angle_deg == pytest.approx(float(torch.tensor(KINK_DEG).norm()), abs=2)
     assert found.sureness > 4
@@ -62,20 +66,20 @@ def test_an_end_that_no_two_views_show_is_not_asked(scene: Scene) -> None:
     beside = TRUTH.with_object(
         "device", off(TRUTH.camera1_from["device"], REFERENCE_POINTS["device"], (0, 0, 0), (150, 0, 0))
     )
-    assert all(bend(scene, beside, "device", share, PLAIN) is None for share in CUTS)
+    assert all(bent(scene, beside, "device", share) is None for share in CUTS)
 
 
 def test_an_end_that_shutters_hide_is_not_asked(scene: Scene) -> None:
     shut = torch.zeros(scene.carm.camera.shape, dtype=torch.bool)
     behind = replace(scene, fields={"device": (shut, shut, None)})
-    assert bend(behind, TRUTH, "device", 0.5, PLAIN) is None
-    assert bend(behind, TRUTH, "femur", 0.5, PLAIN) is not None  # the images without the device are exposed
+    assert bent(behind, TRUTH, "device", 0.5) is None
+    assert bent(behind, TRUTH, "femur", 0.5) is not None  # the images without the device are exposed
 
 
 def test_a_turn_that_no_image_tells_is_no_break() -> None:
     """The shaft of a tibia is round. A pin that its model lacks crosses the cut, and asks the lower end to turn."""
     scene, poses, name = _tibia(broken_deg=0.0)
-    free, told = (bend(scene, poses, name, 0.5, PLAIN, only_told) for only_told in (False, True))
+    free, told = (bent(scene, poses, name, 0.5, only_told) for only_told in (False, True))
     assert free is not None
     assert told is not None
     assert free.apart_mm > 0.8  # with a gain of 0.003, both of which are those of broken necks

@@ -15,7 +15,7 @@ from femoreg_torch.registration.besides import besides, rival
 from femoreg_torch.registration.doubts import doubts_about_rigidity
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.prepare import prepare_scene
-from femoreg_torch.registration.rigidity import bend
+from femoreg_torch.registration.rigidity import bend, images_of
 
 TRUTH = true_poses()
 ROWS = torch.arange(88)[:, None].expand(88, 88)
@@ -74,7 +74,7 @@ def test_an_image_with_a_device_is_cut_where_that_without_it_is() -> None:
 def test_nothing_is_said_where_all_is_saturated() -> None:
     everywhere = torch.ones(88, 88, dtype=torch.bool)
     clear = replace(make_scene(TRUTH), saturated={"anatomy": (everywhere,) * 3}).where_unsaturated()
-    assert bend(clear, TRUTH, "femur", 0.5, PLAIN) is None
+    assert bend(clear, TRUTH, "femur", 0.5, images_of(clear, TRUTH, "femur", PLAIN)) is None
     assert besides(clear, TRUTH, "device", "device") == []
     assert rival(clear, TRUTH, "device", "device", PLAIN) is None
 
