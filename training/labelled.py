@@ -13,7 +13,7 @@ from torch import Tensor
 from femoreg_torch.anatomy import HIP, LabelTable
 from femoreg_torch.detect import filled, image_from_network
 from femoreg_torch.detect.grid import NETWORK_SIZE
-from femoreg_torch.fluoro import Display, attenuation_image, exposed_field
+from femoreg_torch.fluoro import Display, attenuation_image, exposed_field, nearest_source
 from femoreg_torch.geometry import Camera, centred_camera
 from femoreg_torch.neighbours.deepfluoro import (
     BONES,
@@ -72,6 +72,7 @@ def images_of_file(path: Path) -> Iterable[LabelledImage]:
             points=content.landmarks_lps,
             camera_from_lps=content.camera_from_lps[n],
             outline=outline,
+            display=Display(nearest_source(content.camera_from_lps[n][2, :3])),
         )
 
 

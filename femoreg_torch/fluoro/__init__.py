@@ -2,7 +2,7 @@
 
 from femoreg_torch.fluoro.collimation import Shutter, exposed_field, find_shutter, without_penumbra
 from femoreg_torch.fluoro.dicom import Frames, carm_settings, read_header
-from femoreg_torch.fluoro.display import SOURCES, TURNS, Display, Source
+from femoreg_torch.fluoro.display import SOURCES, TURNS, Display, Source, nearest_source
 from femoreg_torch.fluoro.distortion import Distortion, GridImage, find_distortion, find_grid_spots
 from femoreg_torch.fluoro.field import Circle, Polygon
 from femoreg_torch.fluoro.intensity import (
@@ -56,6 +56,7 @@ __all__ = [
     "may_be_image",
     "natural",
     "nearest_side",
+    "nearest_source",
     "read_header",
     "read_image",
     "read_stored",

@@ -25,6 +25,11 @@ _BEAMS = {
 }
 
 
+def nearest_source(beam: Tensor) -> Source:
+    """The side of the patient that the source of a `beam` (3,), from source to detector in LPS, stands on or near."""
+    return max(SOURCES, key=lambda source: float(beam @ beam.new_tensor(_BEAMS[source])))
+
+
 @dataclass(frozen=True)
 class Display:
     """How pictures are stored.

@@ -11,7 +11,7 @@ from femoreg_torch.anatomy import HIP, Anatomy
 from femoreg_torch.case import Case, LandmarkRecord, StartRecord
 from femoreg_torch.detect import Detection, as_stored, filled, within_field
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import SOURCES, Display
+from femoreg_torch.fluoro import Display, nearest_source
 from femoreg_torch.geometry import Camera, transform_points
 from femoreg_torch.pnp import FRONT_TO_BACK, MINIMUM, PnpResult, likely_pose, solve_pnp
 from femoreg_torch.registration.prepare import view_distortion
@@ -229,7 +229,7 @@ def _check_beam(camera_from_ct: Tensor, display: Display) -> None:
     """Raises `InputError` where landmarks tell another side of the source than the case does."""
     beam = camera_from_ct[2, :3]
     off = math.degrees(math.acos(float((beam @ beam.new_tensor(display.beam)).clamp(-1, 1))))
-    nearest = max(SOURCES, key=lambda source: float(beam @ beam.new_tensor(Display(source).beam)))
+    nearest = nearest_source(beam)
     if off > _MOST_ASKEW_DEG and nearest != display.source:  # steep views of the same side are right
         raise InputError(
             f"landmarks in the image: by them the source stands {off:.0f}° from the patient's {display.source} side, "

@@ -131,6 +131,8 @@ def _write_patient(
     devices = make_devices(settings)
     for n in range(count):
         view = render_physics(patient, settings, camera, camera, devices, rng, noise)
-        projs[n] = attenuation_image(view.image.float()).numpy()
-        segs[n] = view.labels.numpy()
-        lands[n] = view.landmarks.T.numpy()
+        image, labels, landmarks = attenuation_image(view.image.float()), view.labels, view.landmarks
+        if view.pose.mirrored:  # for display
+            image, labels, landmarks = image.flip(-1), labels.flip(-1), landmarks.clone()
+            landmarks[:, 0] = camera.shape[1] - 1 - landmarks[:, 0]
+        projs[n], segs[n], lands[n] = image.numpy(), labels.numpy(), landmarks.T.numpy()

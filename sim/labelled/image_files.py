@@ -1,6 +1,6 @@
 """Labelled fluoroscopy at full physics strength: images, labels, landmarks and true poses of one patient.
 
-There is one file (safetensors) per patient; for its N views it holds:
+There is one file (safetensors) per patient; for its N views, as the source sees them, it holds:
 
     images             (N, H, W) uint16          raw counts, bone dark
     labels             (N, H / 2, W / 2) uint8   class of the bone that is seen; 0 background
@@ -78,11 +78,10 @@ def render_views(
 ) -> LabelledImages:
     """`count` random views of one patient, on the detector of the C-arm binned as `settings` say.
 
-    Views are rigid and from the front, so that one pose tells all: raises `InputError` unless the size, stretch and
-    posterior share of the views are 0.
+    Views are rigid, so that one pose tells all: raises `InputError` unless the size and stretch of the views are 0.
     """
-    if settings.views.size or settings.views.stretch or settings.views.posterior_share:
-        raise InputError("labelled images: size, stretch and posterior_share of `views` must be 0.")
+    if settings.views.size or settings.views.stretch:
+        raise InputError("labelled images: size and stretch of `views` must be 0.")
     camera = load_carm(settings.carm).camera.downsampled(settings.image.binning)
     rng, noise = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     devices = make_devices(settings)

@@ -25,7 +25,7 @@ from sim.physics.line_integrals import areal_densities, areal_tissue
 
 @dataclass(frozen=True)
 class PhysicsView:
-    """One view; where it is mirrored, image, labels and landmarks are as displayed, the pose as the camera sees it."""
+    """One view, as the camera sees it."""
 
     image: Tensor  # (H, W) uint16, raw counts, bone dark
     labels: Tensor  # (h, w) uint8, classes of bones
@@ -75,7 +75,4 @@ def render_physics(
     image = fluoroscopy(areal, camera, model, noise)
     labels = _render_labels(patient, pose, labels_camera)
     landmarks = project_points(camera, transform_points(pose.camera_from_lps, patient.landmarks)).float()
-    if pose.mirrored:
-        image, labels = image.flip(-1), labels.flip(-1)
-        landmarks[:, 0] = camera.shape[1] - 1 - landmarks[:, 0]
     return PhysicsView(image, labels, landmarks, pose, has_device, one_hip, model)

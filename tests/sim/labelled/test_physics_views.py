@@ -18,6 +18,7 @@ from sim.labelled.image_files import read_labelled, render_views, write_labelled
 from sim.labelled.imaged_patient import prepare_patient
 from sim.labelled.settings import ImageGrid, load_labelled_settings
 from sim.physics.fluoroscopy import XrayModel
+from training.labelled import images_of_file
 
 MARKED = ("FH-l", "FH-r", "SPS-l", "ASIS-r")
 
@@ -97,6 +98,25 @@ def test_labels_lie_on_their_side_and_on_half_the_grid(labelled):
     assert len(both) >= 2
     for n in both:  # patient's left on the right
         assert left[n].nonzero()[:, 1].float().mean() > right[n].nonzero()[:, 1].float().mean()
+
+
+@pytest.mark.parametrize("kind", ["posterior", "sides"])
+def test_views_of_other_sides_are_stored_as_the_source_sees_them(patient, settings, tmp_path, kind):
+    shares = {"posterior_share": 1.0} if kind == "posterior" else {"side_share": 1.0}
+    views = replace(settings.views, one_hip_share=0.0, **shares)
+    content = render_views(patient, replace(settings, views=views), 4, seed=5, source="boxes")
+    points = transform_points(content.camera_from_lps, content.landmarks_lps.expand(4, -1, -1))
+    assert_close(project_points(content.camera, points).float(), content.landmarks)
+    write_labelled(tmp_path / "a.safetensors", content)
+    images = list(images_of_file(tmp_path / "a.safetensors"))
+    sources = {image.display.source for image in images}
+    assert sources == ({"posterior"} if kind == "posterior" else {"left", "right"})
+    for image in images:
+        x_of_left = image.landmarks[HIP.landmark_names.index("FH-l"), 0]
+        x_of_right = image.landmarks[HIP.landmark_names.index("FH-r"), 0]
+        if kind == "posterior":
+            assert x_of_left < x_of_right
+            assert image.display.left_on_left
 
 
 def test_files_hold_what_was_rendered(labelled, patient, settings, tmp_path):
