@@ -1,6 +1,7 @@
 """Fluoroscopic images: files, display, the exposed field, attenuation, distortion and coarser grids."""
 
 from femoreg_torch.fluoro.collimation import Shutter, exposed_field, find_shutter, without_penumbra
+from femoreg_torch.fluoro.defects import without_defects
 from femoreg_torch.fluoro.dicom import Frames, carm_settings, read_header
 from femoreg_torch.fluoro.display import SOURCES, TURNS, Display, Source, nearest_source
 from femoreg_torch.fluoro.distortion import Distortion, GridImage, find_distortion, find_grid_spots
@@ -62,6 +63,7 @@ __all__ = [
     "read_stored",
     "saturated",
     "settled_intensity",
+    "without_defects",
     "without_penumbra",
     "write_image",
 ]

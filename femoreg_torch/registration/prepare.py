@@ -29,6 +29,7 @@ from femoreg_torch.fluoro import (
     read_stored,
     saturated,
     settled_intensity,
+    without_defects,
     without_penumbra,
 )
 from femoreg_torch.registration.models import ModelVolumes, model_attenuation
@@ -330,8 +331,10 @@ def _read_image(case: Case, index: int, kind: Kind) -> _Image:
     file = f"{where}: {view.images[kind].name}"
     check_header(stored.tags, as_stored, display, case.carm.uncertainty, file)
     logarithms = settled_intensity(view.intensity, stored, file) == "log"
+    light = intensity_of(stored.values) if logarithms else stored.values
+    values, mended = without_defects(stored.values, light, as_stored.mean_pixel_mm)
     distortion = view_distortion(case, index)
-    straight = stored.values if distortion is None else distortion.straightened(stored.values)
+    straight = values if distortion is None else distortion.straightened(values)
     image = display.to_camera(straight)
     raw = intensity_of(image) if logarithms else image
     if not logarithms:
@@ -344,7 +347,7 @@ def _read_image(case: Case, index: int, kind: Kind) -> _Image:
     dark = None if logarithms else below_zero(stored.values, stored.padding)
     remarks = (
         *bent,
-        *(f"{view.images[kind].name} {remark}" for remark in (*stored.remarks, *filter(None, [dark]))),
+        *(f"{view.images[kind].name} {remark}" for remark in (*stored.remarks, *filter(None, [dark, mended]))),
         *([shutter] if shutter else []),
     )
     return _Image(
