@@ -1,6 +1,7 @@
 """The grid that networks are given: 192 × 192 pixels of 1.552 mm, the paper's detector averaged over 8 × 8 blocks.
 
-It lies centred on the image, whatever size and pixels that has: a larger image is cropped, a smaller one padded.
+It lies centred on the image, whatever size and pixels that has. A smaller image is padded; on a larger one the pixels
+grow until all of it is on the grid.
 """
 
 import torch
@@ -11,11 +12,19 @@ from femoreg_torch.geometry import Camera
 
 NETWORK_SIZE = 192
 NETWORK_PIXEL_MM = 1.552
+_TOO_LARGE_MM = 1.0  # by which an image may stick out of the grid
+
+
+def _pixel_mm(camera: Camera) -> float:
+    """Of the grid for images of `camera`."""
+    longest = max(size * pixel for size, pixel in zip(camera.shape, camera.pixel_mm, strict=True))
+    fits = longest < NETWORK_SIZE * NETWORK_PIXEL_MM + _TOO_LARGE_MM
+    return NETWORK_PIXEL_MM if fits else longest / NETWORK_SIZE
 
 
 def _zoom(camera: Camera) -> Tensor:
     """Image pixels per network pixel along (columns, rows)."""
-    return NETWORK_PIXEL_MM / torch.tensor([camera.pixel_mm[1], camera.pixel_mm[0]], dtype=torch.float64)
+    return _pixel_mm(camera) / torch.tensor([camera.pixel_mm[1], camera.pixel_mm[0]], dtype=torch.float64)
 
 
 def _middle(shape: tuple[int, int]) -> Tensor:
@@ -28,7 +37,8 @@ def network_camera(camera: Camera) -> Camera:
     shape = (NETWORK_SIZE, NETWORK_SIZE)
     principal = torch.tensor(camera.principal_point_px, dtype=torch.float64)
     column, row = ((principal - _middle(camera.shape)) / _zoom(camera) + _middle(shape)).tolist()
-    return Camera(camera.sdd_mm, (NETWORK_PIXEL_MM, NETWORK_PIXEL_MM), shape, (column, row))
+    pixel = _pixel_mm(camera)
+    return Camera(camera.sdd_mm, (pixel, pixel), shape, (column, row))
 
 
 def image_from_network(pixels: Tensor, camera: Camera) -> Tensor:

@@ -23,7 +23,20 @@ CAMERAS = [
     centred_camera(1020.0, (0.388, 0.388), (768, 768)),
     Camera(980.0, (0.3, 0.25), (1001, 1100), (520.0, 470.0)),
     Camera(1100.0, (2.0, 2.0), (140, 151), (70.0, 66.0)),
+    Camera(1200.0, (0.9, 0.8), (444, 520), (255.0, 220.0)),  # larger than the grid
 ]
+
+
+def test_a_large_image_is_on_the_grid_as_a_whole() -> None:
+    camera = CAMERAS[-1]
+    grid = network_camera(camera)
+    assert grid.pixel_mm == (520 * 0.8 / 192,) * 2
+    corners = image_from_network(torch.tensor([[-0.5, -0.5], [191.5, 191.5]], dtype=torch.float64), camera)
+    assert_close(corners[:, 0], torch.tensor([-0.5, 519.5], dtype=torch.float64))
+    assert corners[0, 1] < -0.5
+    assert corners[1, 1] > 443.5
+    barely = centred_camera(1000.0, (0.2, 0.2), (1492, 1492))  # 298.4 mm: as good as what networks were trained on
+    assert network_camera(barely).pixel_mm == (1.552, 1.552)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -41,4 +54,9 @@ def test_a_blob_stays_where_it_is(camera: Camera) -> None:
     small = to_network_grid(blob.float(), camera).double()
     axis = torch.arange(192, dtype=torch.float64)
     centroid = torch.stack([(small.sum(0) * axis).sum(), (small.sum(1) * axis).sum()]) / small.sum()
-    assert_close(image_from_network(centroid, camera), truth, atol=0.05 * 1.552 / camera.pixel_mm[0], rtol=0)
+    assert_close(
+        image_from_network(centroid, camera),
+        truth,
+        atol=0.05 * network_camera(camera).pixel_mm[0] / camera.pixel_mm[0],
+        rtol=0,
+    )
