@@ -26,8 +26,9 @@ _MARGIN = 6  # voxels around a bone
 def landmarks_by_rule(layers: Layers) -> Tensor:
     """Landmarks (L, 3) of `layers` in LPS mm, found on the masks of both hip bones.
 
-    The heads stay as they are. A landmark whose rule lands more than 15 mm from `layers.landmarks` keeps that place.
-    Raises `InputError` if the masks' axes do not run along +x, +y, +z.
+    The heads stay as they are. A landmark whose rule lands more than 15 mm from `layers.landmarks` keeps that place,
+    and so do all of a patient whose obturator foramina are to be seen on none of the smoothed surfaces. Raises
+    `InputError` if the masks' axes do not run along +x, +y, +z.
     """
     known = dict(zip(HIP.landmark_names, layers.landmarks.numpy(), strict=True))
     heads = {side: known[f"FH-{side[0]}"] for side in SIDES}
@@ -37,8 +38,13 @@ def landmarks_by_rule(layers: Layers) -> Tensor:
     found = []
     for smoothing in _SMOOTHINGS_MM:
         hips = {side: _field(mask, centre, smoothing) for side, mask in masks.items()}
-        points = find_on_hips(hips, centred)
+        try:
+            points = find_on_hips(hips, centred)
+        except InputError:  # a thin ring that was bent may break, or close, on one of the surfaces
+            continue
         found.append(np.stack([points[name] for name in HIP.landmark_names]) + centre)
+    if not found:
+        return layers.landmarks
     mean = torch.from_numpy(np.mean(found, 0))
     lost = (mean - layers.landmarks).norm(dim=1, keepdim=True) > _JUMP_MM
     return torch.where(lost, layers.landmarks, mean)
