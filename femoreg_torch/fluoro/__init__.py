@@ -5,7 +5,7 @@ from femoreg_torch.fluoro.defects import without_defects
 from femoreg_torch.fluoro.dicom import Frames, carm_settings, read_header
 from femoreg_torch.fluoro.display import SOURCES, TURNS, Display, Source, nearest_source
 from femoreg_torch.fluoro.distortion import Distortion, GridImage, find_distortion, find_grid_spots
-from femoreg_torch.fluoro.field import Circle, Polygon
+from femoreg_torch.fluoro.field import Circle, Polygon, blank_lines
 from femoreg_torch.fluoro.intensity import (
     attenuation_image,
     below_zero,
@@ -43,6 +43,7 @@ __all__ = [
     "attenuation_image",
     "below_zero",
     "binned",
+    "blank_lines",
     "carm_settings",
     "check_header",
     "check_intensity",

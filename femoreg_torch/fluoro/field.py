@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+_SIDE_BY_SIDE = 8  # lines; fewer may be dead ones of the detector
+
 
 @dataclass(frozen=True)
 class Circle:
@@ -40,3 +42,23 @@ def _pixels(shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Columns (1, W) and rows (H, 1)."""
     rows, columns = (torch.arange(n, dtype=torch.float64) for n in shape)
     return columns[None], rows[:, None]
+
+
+def blank_lines(light: Tensor) -> Tensor | None:
+    """The pixels (H, W), bool, of whole rows and columns that hold nothing but an image's least intensity.
+
+    As a file that was cut short leaves them, or a picture set into a larger one: noise leaves no such line. None where
+    there are fewer than eight of them side by side, or nothing else.
+    """
+    darkest = light == light.min()
+    rows, columns = (_runs(darkest.all(dim)) for dim in (1, 0))
+    blank = rows[:, None] | columns
+    return blank if blank.any() and not blank.all() else None
+
+
+def _runs(lines: Tensor) -> Tensor:
+    """Those of lines (N,), bool, that stand with seven others or more side by side."""
+    if not lines.any():
+        return lines
+    _, part, length = torch.unique_consecutive(lines, return_inverse=True, return_counts=True)
+    return lines & (length[part] >= _SIDE_BY_SIDE)

@@ -19,6 +19,7 @@ from femoreg_torch.fluoro import (
     StoredImage,
     attenuation_image,
     below_zero,
+    blank_lines,
     check_header,
     check_intensity,
     check_matches,
@@ -379,7 +380,7 @@ def _field(
     """The exposed pixels (H, W) of an image `raw` of a view (from 0), None for all, and where they come from, in words.
 
     The field is what the case tells, or else what the header's shutter leaves, or else what a shutter in the image
-    leaves; pixels that hold no image are never exposed.
+    leaves, or rows and columns without an image; pixels that hold no image are never exposed.
     """
     camera, display, told = case.carm.camera, case.display_of(index), case.views[index].field
     field, words = None, None
@@ -399,7 +400,11 @@ def _field(
         return without_penumbra(field, camera), words
     shutter = find_shutter(raw, camera)
     if shutter is None:
-        return None, None
+        blank = blank_lines(raw)
+        if blank is None:
+            return None, None
+        words = f"{100 * float(blank.double().mean()):.0f} % of it, whole rows or columns, hold no image"
+        return without_penumbra(~blank, camera), words
     words = f"a {shutter.shape} shutter was found, {100 * shutter.exposed:.0f} % of the detector is exposed"
     return shutter.field, words
 
