@@ -37,7 +37,7 @@ def tell_device(console: Console, name: DeviceName) -> torch.device:
 
 
 def tell_verdict(console: Console, result: Result) -> None:
-    """The verdict, and what was left out."""
+    """The verdict, and what was left out or found on the way."""
     verdict = result.verdict
     if verdict.trusted:
         console.print(f"[green]{escape(verdict.sentence)}[/]")
@@ -46,4 +46,4 @@ def tell_verdict(console: Console, result: Result) -> None:
         for reason in verdict.reasons:
             console.print(f"  {escape(reason)}")
     for note in result.skipped:
-        console.print(f"[yellow]Left out:[/] {escape(note)}.")
+        console.print(f"[yellow]Note:[/] {escape(note)}.")
