@@ -56,13 +56,13 @@ def summarise(readings: Sequence[Reading], seed: int = 0) -> Accuracy:
     """All figures with their intervals, and the accuracy of each landmark."""
     patients = sorted({reading.patient for reading in readings})
     groups = [[reading for reading in readings if reading.patient == patient] for patient in patients]
-    value = _figures(readings)
+    value = figures(readings)
     rng = np.random.default_rng(seed)
     # Not scipy's bootstrap: a figure may be missing (nan) in some redraws, and of few patients most are the same.
     redraws = Counter(tuple(sorted(rng.integers(len(groups), size=len(groups)))) for _ in range(_REDRAWS))
     drawn: dict[str, list[float]] = {name: [] for name in value}
     for redraw, times in redraws.items():
-        for name, figure in _figures([reading for n in redraw for reading in groups[n]]).items():
+        for name, figure in figures([reading for n in redraw for reading in groups[n]]).items():
             drawn[name] += [figure] * times
     measures = {name: _measure(figure, drawn[name]) for name, figure in value.items()}
     return Accuracy(len(readings), len(patients), measures, _per_landmark(readings))
@@ -75,7 +75,8 @@ def _measure(value: float, drawn: list[float]) -> Measure:
     return Measure(value, float(low), float(high))
 
 
-def _figures(readings: Sequence[Reading]) -> dict[str, float]:
+def figures(readings: Sequence[Reading]) -> dict[str, float]:
+    """All figures of one or more readings; nan where nothing could be counted."""
     error, found, visible = (
         np.stack([getattr(r, name) for r in readings]) for name in ("error_mm", "found", "visible")
     )

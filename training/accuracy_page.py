@@ -8,7 +8,8 @@ from pathlib import Path
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import write_json, write_text
-from training.accuracy import COARSE, FAIR, GROSS_MM, NEAR_MM, REGISTERED_DEG, Accuracy, Measure, summarise
+from femoreg_torch.fluoro import SOURCES
+from training.accuracy import COARSE, FAIR, GROSS_MM, NEAR_MM, REGISTERED_DEG, Accuracy, Measure, figures, summarise
 from training.calibration import RIGHT_MM, calibration_error, draw_reliability
 from training.measure import Reading
 from training.robustness import Outcomes
@@ -46,7 +47,7 @@ def write_accuracy(out: Path, readings: Sequence[Reading], altered: Mapping[str,
     outcomes = {name: asdict(counted) for name, counted in altered.items()}
     write_json(out / "accuracy.json", {**asdict(accuracy), "calibration_error": error, "altered": outcomes})
     draw_reliability(readings, out / "reliability.png")
-    page = "\n".join([*_figures(accuracy), "", *_calibration(error), *_altered(altered)]) + "\n"
+    page = "\n".join([*_figures(accuracy), "", *_by_source(readings), *_calibration(error), *_altered(altered)]) + "\n"
     write_text(out / "accuracy.md", page)
     return page
 
@@ -70,6 +71,26 @@ def _figures(accuracy: Accuracy) -> list[str]:
         found = [_number(one.mean_mm, 1), _number(one.median_mm, 1), _number(100 * one.recall, 0, " %")]
         lines.append(f"| {name} | {' | '.join(found)} | {one.in_image} |")
     return lines
+
+
+def _by_source(readings: Sequence[Reading]) -> list[str]:
+    """A line for each side of the patient that a source stood on; none where that was one and the same."""
+    groups = {source: [one for one in readings if one.source == source] for source in SOURCES}
+    groups = {source: group for source, group in groups.items() if group}
+    if len(groups) < 2:
+        return []
+    lines = [
+        "| source | images | error, median | recall | false positives | {} | refused |".format(_ROWS["pose_fair"][0]),
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for source, group in groups.items():
+        values = figures(group)
+        told = [_number(values["median_mm"], 1, " mm")]
+        told += [
+            _number(100 * values[key], 1, " %") for key in ("recall", "false_positives", "pose_fair", "pose_refused")
+        ]
+        lines.append(f"| {source} | {len(group)} | {' | '.join(told)} |")
+    return [*lines, ""]
 
 
 def _calibration(error: float) -> list[str]:

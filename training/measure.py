@@ -16,7 +16,7 @@ from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import Detection, LandmarkNetwork, as_stored, detect
 from femoreg_torch.detect.tta import AUGMENTATIONS, Augmentation
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import Display
+from femoreg_torch.fluoro import Display, Source
 from femoreg_torch.geometry import rotation_angle, transform_points
 from femoreg_torch.registration.start import find_start
 from training.augmentation import inside
@@ -42,6 +42,7 @@ class Reading:
     refused: bool  # whether it was asked for and none was given
     pose_error: Array  # (3,) degrees, mm across, mm in depth at the landmarks' middle; nan without a pose
     registered_error: Array | None = None  # (3,) the same after single-view registration, if it was run
+    source: Source = "anterior"  # the side of the patient that it stood on
 
 
 def read_images(
@@ -72,6 +73,7 @@ def _read(detection: Detection, image: LabelledImage, register: Registration | N
     registered = register(image, start) if register is not None and start is not None else None
     return Reading(
         patient=image.patient,
+        source=image.display.source,
         error_mm=error.numpy(),
         found=detection.visible.numpy(),
         visible=there.numpy(),

@@ -53,6 +53,14 @@ def test_several_patients_have_intervals_and_landmarks_that_no_image_shows_a_das
     assert "| GSN-r | – | – | – | 0 |" in lines
 
 
+def test_views_from_several_sides_have_a_line_for_each(readings: list[Reading], tmp_path: Path) -> None:
+    assert "| source |" not in write_accuracy(tmp_path / "one", readings, {})
+    refused = replace(readings[0], source="left", refused=True, pose_error=np.full(3, np.nan))
+    lines = write_accuracy(tmp_path / "two", [*readings, *readings, refused], {}).splitlines()
+    assert "| anterior | 2 | 2.0 mm | 100.0 % | – | 100.0 % | 0.0 % |" in lines
+    assert "| left | 1 | 2.0 mm | 100.0 % | – | 0.0 % | 100.0 % |" in lines
+
+
 def test_what_was_not_measured_is_left_out(readings: list[Reading], tmp_path: Path) -> None:
     page = write_accuracy(tmp_path, readings, {})
     assert "altered" not in page
