@@ -27,6 +27,9 @@ LEAST_OVERLAP = 0.90  # Dice of the outlined bones
 # outlines. Outlines mend what is more open (9° open: 2 to 3° off afterwards).
 MOST_ROTATION_DEG = 5.0
 _MIRRORED = Display(mirrored=True)
+_FEW_GREYS = 16  # pictures of 16 bits of a stout patient held 300, one of 8 bits two
+_OF_8_BITS = 256
+_ASKED_PX = 200_000
 _SURE_OF_SIDES = 3.0  # log likelihood by which landmarks are to fit better than those of the other side
 _OF_A_SIDE = (
     "This view is taken from a side, and the shipped network knows views from the front and from behind: pick the "
@@ -61,6 +64,12 @@ def start_by_detection(case: Case, scene: Scene, detection: Detection, find: Det
         )
     except InputError as error:
         seen = f"{case.views[0].images[scene.first_kind]}: {error}"
+        if (greys := _greys_where_dense(image, field)) is not None:
+            raise InputError(
+                f"{case.views[0].images[scene.first_kind]}: half of the picture, where the patient is dense, holds no "
+                f"more than {greys} grey value{'s' * (greys != 1)}, so hardly a bone is to be seen. Is it of 8 bits, "
+                "in proportion to the light? Export it with 16 bits, or its logarithm."
+            ) from error
         if case.display_of(0).source in ("left", "right"):
             raise InputError(f"{seen} {_OF_A_SIDE}") from error
         turned = () if find is None else _told_turned(case, scene, anatomy, find)
@@ -69,6 +78,14 @@ def start_by_detection(case: Case, scene: Scene, detection: Detection, find: Det
     if (distortion := view_distortion(case, 0)) is not None:
         stored = torch.from_numpy(distortion.bent(stored.numpy()))
     return _record(scene.anchor, replace(detection, pixels=stored), start, anatomy.landmark_names)
+
+
+def _greys_where_dense(attenuation: Tensor, field: Tensor | None) -> int | None:
+    """How many grey values the denser half of what is exposed holds, if they are few and the picture is of 8 bits."""
+    exposed = attenuation.flatten() if field is None else attenuation[field]
+    some = exposed[:: max(1, len(exposed) // _ASKED_PX)]
+    greys = len(torch.unique(some[some >= some.median()]))
+    return greys if greys <= _FEW_GREYS and len(torch.unique(some)) <= _OF_8_BITS else None
 
 
 def _told_turned(case: Case, scene: Scene, anatomy: Anatomy, find: Detector) -> tuple[str, ...]:

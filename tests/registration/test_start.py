@@ -69,6 +69,14 @@ def test_inverted_grey_values_are_refused_however_many_landmarks_there_are() -> 
         start_by_detection(hip_case(), scene(), detection(14, inverted=True))
 
 
+def test_a_picture_with_hardly_a_grey_value_where_bones_are_is_told_so() -> None:
+    """As one of 8 bits in proportion to the light; that bone were dark would be told falsely."""
+    full = scene()
+    coarse = (4 * full.images["anatomy"][0]).round() / 4
+    with pytest.raises(InputError, match=r"view1.tif: half of the picture.* no more than 3 grey values.*16 bits"):
+        start_by_detection(hip_case(), replace(full, images={"anatomy": (coarse,)}), detection(14, inverted=True))
+
+
 @pytest.mark.parametrize(
     ("display", "turned"), [(Display(), 90), (Display(turned_deg=90), 180), (Display("posterior"), 270)]
 )
