@@ -19,6 +19,7 @@ from torch.nn import functional as F
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import normalise
 from femoreg_torch.settings import check_rising, check_within
+from training.implants import add_implants
 
 _COARSE_KNOTS, _FINE_KNOTS = 4, 14  # along each axis of the image, of the fields `unevenness` and `gas`
 
@@ -34,6 +35,7 @@ class AugmentationSettings:
     gas: float = 0.15  # and of a finer one, as of gas and folds of soft tissue
     edge_share: float = 0.15  # table edges and covers: a straight step of attenuation
     instrument_share: float = 0.35
+    implant_share: float = 0.0  # of the femora in view: nails, plates, artificial hips
     device_share: float = 0.25  # images with a drilling device, where the cohort has any
     device: tuple[float, float] = (0.15, 1.2)  # factor of its attenuation; log-uniform
     vignetting: float = 0.4  # greatest loss of signal in the corners
@@ -310,6 +312,8 @@ def make_batch(
     visible = inside(landmarks, shape)
     images, labels, landmarks = move(images, labels, landmarks, random_affine(count, shape[0], settings, generator))
     visible &= inside(landmarks, shape)
+    if settings.implant_share:
+        images = add_implants(images, labels, landmarks, settings.implant_share, generator)
     images = add_instruments(images, settings, generator)
     if devices is not None:
         images = add_devices(images, devices, settings, generator)
