@@ -19,6 +19,10 @@ from femoreg_torch.errors import InputError, shortened
 META_SUFFIXES, NRRD_SUFFIXES = (".mha", ".mhd"), (".nrrd", ".nhdr")
 _LONGEST_HEADER = 2**20  # bytes; a segmentation of 3D Slicer names all its segments there
 _CHUNK = 2**20
+_OTHER_UNITS = {  # of lengths; what else may stand there says nothing, as "" for an axis that is no length
+    "m", "meter", "meters", "metre", "metres", "dm", "cm", "centimeter", "centimeters", "centimetre", "centimetres",
+    "um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "nm", "in", "inch", "inches",
+}  # fmt: skip
 _NOWHERE = re.compile(r"nan|inf", re.IGNORECASE)
 _PLACES = (  # fields of both formats that say where voxels lie
     "Offset", "Position", "Origin", "ElementSpacing", "TransformMatrix", "Rotation", "Orientation", "space origin",
@@ -100,6 +104,7 @@ def _of_meta_image(beginning: bytes, path: Path) -> _Values:
             )
     if not _is_true(fields.get("BinaryData", "True")):
         raise InputError(f"{path}: its values are text (`BinaryData` in its header). Save them as binary.")
+    _check_units([fields.get("DistanceUnits", "")], path)
     shape = _sizes(fields, "DimSize", path)
     each = _bytes_each(fields, "ElementType", _META_BYTES, path)
     channels = _number(fields, "ElementNumberOfChannels", path, least=1, most=2**16, otherwise="1")
@@ -129,6 +134,7 @@ def _of_nrrd(beginning: bytes, path: Path) -> _Values:
     there = path if source is None else _file_of_values(source, path)
     if source is None and end is None:
         raise InputError(f"{path}: no empty line ends its header, so it holds no values. Export it anew.")
+    _check_units(re.findall(r'"([^"]*)"', fields.get("space units", fields.get("units", ""))), path)
     shape = _sizes(fields, "sizes", path)
     each = _bytes_each({"type": fields.get("type", "").lower()}, "type", _NRRD_BYTES, path)
     check_claim(path, shape, each, None)
@@ -138,6 +144,14 @@ def _of_nrrd(beginning: bytes, path: Path) -> _Values:
         return _Values(there, 0, None, False)
     start = end.end() if source is None and end is not None else 0
     return _Values(there, start, math.prod(shape) * each, encoding != "raw")
+
+
+def _check_units(units: Iterable[str], path: Path) -> None:
+    """Raises `InputError` for lengths that are not in mm: ITK passes over their unit and takes all for mm."""
+    if others := [unit for unit in units if unit.strip().lower() in _OTHER_UNITS]:
+        raise InputError(
+            f"{path}: its header tells lengths in {others[0].strip()}, but mm were expected. Save it anew in mm."
+        )
 
 
 def _fields(lines: Iterable[str], sign: str, path: Path) -> dict[str, str]:

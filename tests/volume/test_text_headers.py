@@ -122,3 +122,28 @@ def test_what_users_add_to_an_nrrd_header(tmp_path: Path) -> None:
     more = b"encoding: raw\n# a: b\nSegment0_Name:=a: b\nSegment0_Name:=c\n"
     path.write_bytes(path.read_bytes().replace(b"encoding: raw\n", more))
     assert read_itk(path).GetSize() == (7, 8, 9)
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("a.nrrd", 'space units: "cm" "cm" "cm"'),
+        ("a.nrrd", 'space units: "m" "m" "m"'),
+        ("a.nrrd", 'space units: "um" "um" "um"'),
+        ("a.mha", "DistanceUnits = cm"),
+    ],
+)
+def test_lengths_that_are_not_in_mm_are_refused(name: str, line: str, tmp_path: Path) -> None:
+    """ITK reads 0.2 cm as 0.2 mm, a femur of the size of a bean that no other check tells."""
+    path = written(tmp_path / name)
+    mark = b"space directions" if name.endswith("nrrd") else b"ElementDataFile"
+    path.write_bytes(path.read_bytes().replace(mark, line.encode() + b"\n" + mark, 1))
+    with pytest.raises(InputError, match=r"lengths in (cm|m|um), but mm were expected"):
+        read_itk(path)
+
+
+@pytest.mark.parametrize("units", ['"mm" "mm" "mm"', '"" "" ""', '"???" "???" "???"'])
+def test_units_that_are_mm_or_say_nothing_are_read(units: str, tmp_path: Path) -> None:
+    path = written(tmp_path / "a.nrrd")
+    path.write_bytes(path.read_bytes().replace(b"space dir", f"space units: {units}\nspace dir".encode(), 1))
+    assert (sitk.GetArrayFromImage(read_itk(path)) == VOXELS).all()
