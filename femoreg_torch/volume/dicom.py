@@ -7,7 +7,7 @@ missing slices, and over the shear of a tilted gantry.
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,7 +22,7 @@ from femoreg_torch.errors import InputError, shortened
 _TAGS = (
     "SOPInstanceUID", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "ImageType", "Rows",
     "Columns", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "NumberOfFrames", "AcquisitionNumber",
-    "RescaleSlope", "RescaleIntercept",
+    "RescaleSlope", "RescaleIntercept", "PhotometricInterpretation", "BitsStored", "HighBit",
 )  # fmt: skip
 _VOLUMES = ("CT", "MR", "PT", "NM", "OT")  # modalities whose series may be volumes; others are images, reports, masks
 _DEFLATED = "1.2.840.10008.1.2.1.99"  # transfer syntax
@@ -85,11 +85,15 @@ class Series:
 
     @property
     def may_be_volume(self) -> bool:
-        """Whether it may be a CT: several slices, or one file of several frames, and no scout."""
+        """Whether it may be a CT: several slices, or one file of several frames, and no scout.
+
+        Of a series that tells no modality, as some anonymisers leave it, slices with a place in the patient are taken.
+        """
         first = self.slices[0]
         scout = "LOCALIZER" in [str(word).upper() for word in first.header.get("ImageType") or []]
         frames = first.whole("NumberOfFrames", 1)
-        return self.modality in _VOLUMES and not scout and (len(self.slices) > 1 or frames > 1)
+        meant = self.modality.upper() in _VOLUMES or (not self.modality and "ImagePositionPatient" in first.header)
+        return meant and not scout and (len(self.slices) > 1 or frames > 1)
 
 
 def is_dicom(path: Path) -> bool:
@@ -105,13 +109,15 @@ def is_dicom(path: Path) -> bool:
 def series_in(folder: Path) -> list[Series]:
     """All DICOM series in a folder and in the folders inside it, in order of their numbers.
 
-    A file that stands there twice, by its SOP Instance UID, counts once.
+    A file that stands there twice, by its SOP Instance UID and its place, counts once. Images without a Series Instance
+    UID are taken for one series.
     """
     found: dict[str, dict[str, Slice]] = {}
     for one in _headers(folder):
         uid = str(one.header.get("SeriesInstanceUID") or "")
-        if uid:
-            found.setdefault(uid, {}).setdefault(str(one.header.get("SOPInstanceUID") or one.path), one)
+        if uid or "Rows" in one.header:
+            name = one.header.get("SOPInstanceUID") or one.path
+            found.setdefault(uid, {}).setdefault(f"{name} {one.header.get('ImagePositionPatient')}", one)
     series = []
     for uid, slices in found.items():
         first = next(iter(slices.values())).header
@@ -176,11 +182,11 @@ def choose_series(path: Path, wanted: str | None = None) -> Series:
     """
     folder = path if path.is_dir() else path.parent
     there = series_in(folder)
-    if not there or (path.is_file() and not _slice(path).header.get("SeriesInstanceUID")):
+    own = str(_slice(path).header.get("SeriesInstanceUID") or "") if path.is_file() else ""
+    if not there or (path.is_file() and own not in [one.uid for one in there]):
         raise InputError(f"{path}: holds no DICOM series. Give the folder of the slices, or a NIfTI, NRRD or MHA file.")
     if path.is_file():
-        uid = str(_slice(path).header.get("SeriesInstanceUID") or "")
-        return next(one for one in there if one.uid == uid)
+        return next(one for one in there if one.uid == own)
     if wanted is not None:
         exact = [one for one in there if wanted in (one.number, one.uid)]
         chosen = exact or [one for one in there if wanted.lower() in one.description.lower()]
@@ -188,6 +194,12 @@ def choose_series(path: Path, wanted: str | None = None) -> Series:
         chosen = [one for one in there if one.may_be_volume]
     if len(chosen) == 1:
         return chosen[0]
+    alone = not chosen and len(there) > 2 and all(one.modality == "CT" and len(one.slices) == 1 for one in there)
+    if alone and wanted is None:
+        raise InputError(
+            f"{folder}: each of its {len(there)} DICOM files has a SeriesInstanceUID of its own, so they make no "
+            "series. Export or anonymise them anew, with one UID for all."
+        )
     listed = _listed(chosen or there)
     if wanted is not None:
         how = f"{len(chosen)} of its series are {wanted!r}" if chosen else f"none of its series is {wanted!r}"
@@ -222,8 +234,13 @@ def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:
         if series.slices[0].whole("NumberOfFrames", 1) < 2:
             raise InputError(f"{series.slices[0].path}: is a single slice. Give the folder of the whole series.")
         return _multi_frame(series.slices[0].path), ()
+    if several := [one for one in series.slices if one.whole("NumberOfFrames", 1) > 1]:
+        raise InputError(
+            f"{where}: {series.told} has {len(several)} files of several frames each ({several[0].path.name}, …). "
+            "Export it with all frames in one file, or with a file for each slice."
+        )
     layout = _sorted_slices(series, where)
-    image = _decoded([one.path for one in layout.slices])
+    image = _decoded(layout.slices)
     image.SetOrigin(layout.origin.tolist())
     spacing = (*layout.spacing.tolist(), layout.step @ layout.axes[:, 2])
     image.SetSpacing([float(value) for value in spacing])
@@ -236,15 +253,23 @@ def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:
     return _straightened(image, lean), (note,)
 
 
-def _decoded(paths: Sequence[Path]) -> sitk.Image:
+def _decoded(slices: Sequence[Slice]) -> sitk.Image:
     """The pixels of all slices, rescaled, as float32; by pydicom where GDCM cannot. Raises `InputError`."""
+    for one in slices:
+        stored, high = one.number("BitsStored"), one.number("HighBit")
+        if stored is not None and high is not None and high != stored - 1:  # DICOM PS3.5, 8.1.1; GDCM shifts some of it
+            raise InputError(
+                f"{one.path}: its values end at bit {high:g} and have {stored:g} bits (HighBit, BitsStored), which is "
+                "no DICOM of today. Export the series anew."
+            )
     reader = sitk.ImageSeriesReader()
-    reader.SetFileNames([str(path) for path in paths])
+    reader.SetFileNames([str(one.path) for one in slices])
     reader.SetOutputPixelType(sitk.sitkFloat32)
-    try:
-        return reader.Execute()
-    except RuntimeError:  # some RLE, and files without a preamble
-        return sitk.GetImageFromArray(np.stack([_pixels(path) for path in paths]))
+    # GDCM turns the values of MONOCHROME1 over, which is a matter of how they are shown
+    if all(one.header.get("PhotometricInterpretation") != "MONOCHROME1" for one in slices):
+        with suppress(RuntimeError):  # some RLE, and files without a preamble
+            return reader.Execute()
+    return sitk.GetImageFromArray(np.stack([_pixels(one.path) for one in slices]))
 
 
 def _pixels(path: Path) -> NDArray[np.float32]:
@@ -284,6 +309,8 @@ def _sorted_slices(series: Series, where: str) -> _Layout:
     positions = [one.numbers("ImagePositionPatient", 3) for one in series.slices]
     if cosines is None or pixel is None or any(position is None for position in positions):
         raise InputError(f"{where}: position, orientation or pixel spacing of a slice are no numbers. Export it anew.")
+    if pixel.min() <= 0 or not cosines[:3].any() or not cosines[3:].any():
+        raise InputError(f"{where}: pixel spacing or orientation of {first.path.name} is zero. Export the series anew.")
     _check_alike(series, cosines, pixel, where)
     row, column = cosines[:3] / np.linalg.norm(cosines[:3]), cosines[3:] / np.linalg.norm(cosines[3:])
     normal = np.cross(row, column)
@@ -375,8 +402,11 @@ def _multi_frame(path: Path) -> sitk.Image:
     import highdicom  # half a second, and few CTs are of this kind
 
     try:  # what pydicom and highdicom raise for tags that lack or contradict one another, and for broken pixels
-        # HU are what the rescale gives; a map of real-world values may tell iodine or density
-        volume = highdicom.imread(path).get_volume(dtype=np.float32, apply_real_world_transform=False)
+        # HU are what the rescale gives; a map of real-world values may tell iodine or density, and a presentation LUT
+        # turns the values of MONOCHROME1 over
+        volume = highdicom.imread(path).get_volume(
+            dtype=np.float32, apply_real_world_transform=False, apply_presentation_lut=False
+        )
     except (AttributeError, KeyError, NotImplementedError, RuntimeError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: its frames cannot be read as one volume ({error}). Export the series with a file for each slice."

@@ -360,3 +360,64 @@ def test_slices_that_claim_more_pixels_than_they_hold(tmp_path: Path, syntax: st
     damaged.write_bytes(before + np.array(claimed, f"{order}u4").tobytes() + pixels)
     with pytest.raises(InputError, match=f"{damaged.name}: holds fewer pixels than it claims"):
         read_ct(tmp_path / "ct")
+
+
+@pytest.mark.parametrize("kind", ["no series", "no modality", "one instance", "small letters"])
+def test_what_anonymisers_leave_of_a_series_is_read(tmp_path: Path, kind: str) -> None:
+    """Places, not names, make a volume; a scout beside it that tells its modality is still passed over."""
+    folder = tmp_path / "ct"
+    write_series(folder, number=1, values=VALUES[:1], ImageType=["ORIGINAL", "LOCALIZER"])
+    tags = {"no modality": {"Modality": ""}, "small letters": {"Modality": "ct"}}.get(kind, {})
+    for n, data in enumerate(write_series(folder, **tags)):
+        if kind == "no series":
+            del data.SeriesInstanceUID
+        elif kind == "one instance":
+            data.SOPInstanceUID = data.file_meta.MediaStorageSOPInstanceUID = "1.2.3"
+        data.save_as(folder / f"IM{250 - n:04d}")
+    np.testing.assert_allclose(sampled(read_ct(folder), points_of(AXIAL, NO_LEAN)), VALUES - 1024)
+    if kind == "no series":
+        assert read_ct(folder / "IM0250").data.shape == SIZE
+
+
+def test_a_uid_for_each_slice_is_told_as_that(tmp_path: Path) -> None:
+    folder = tmp_path / "ct"
+    for n, data in enumerate(write_series(folder)):
+        data.SeriesInstanceUID = generate_uid()
+        data.save_as(folder / f"IM{250 - n:04d}")
+    with pytest.raises(InputError, match="each of its 7 DICOM files has a SeriesInstanceUID of its own"):
+        read_ct(folder)
+
+
+def test_values_are_those_stored_however_they_are_shown(tmp_path: Path) -> None:
+    """MONOCHROME1 says that low values are shown bright; GDCM and highdicom turn the values themselves over."""
+    single, enhanced = tmp_path / "ct", tmp_path / "enhanced"
+    enhanced.mkdir()
+    whole = LegacyConvertedEnhancedCTImage(write_series(tmp_path / "usual"), generate_uid(), 1, generate_uid(), 1)
+    whole.PhotometricInterpretation = "MONOCHROME1"
+    whole.save_as(enhanced / "one")
+    write_series(single, PhotometricInterpretation="MONOCHROME1")
+    for folder in (single, enhanced):
+        np.testing.assert_allclose(sampled(read_ct(folder), points_of(AXIAL, NO_LEAN)), VALUES - 1024)
+
+
+def test_a_series_of_files_of_several_frames_is_told(tmp_path: Path) -> None:
+    folder, uid = tmp_path / "enhanced", generate_uid()
+    folder.mkdir()
+    slices = write_series(tmp_path / "ct")
+    for n, some in enumerate((slices[:4], slices[4:])):
+        LegacyConvertedEnhancedCTImage(some, uid, 1, generate_uid(), n + 1).save_as(folder / str(n))
+    with pytest.raises(InputError, match="has 2 files of several frames each"):
+        read_ct(folder)
+
+
+@pytest.mark.parametrize(
+    ("tags", "message"),
+    [
+        ({"PixelSpacing": [0, 0.8]}, "pixel spacing or orientation of IM.* is zero"),
+        ({"BitsStored": 12, "HighBit": 15}, "its values end at bit 15 and have 12 bits"),
+    ],
+)
+def test_headers_that_lead_its_reader_astray(tmp_path: Path, tags: dict, message: str) -> None:
+    write_series(tmp_path / "ct", **tags)
+    with pytest.raises(InputError, match=message):
+        read_ct(tmp_path / "ct")
