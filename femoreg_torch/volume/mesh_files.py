@@ -1,7 +1,9 @@
 """Files of CAD meshes: one surface, or several bodies with names. What is read is in mm."""
 
+import re
 import zipfile
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,8 +94,10 @@ def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, tri
     try:
         with quiet():
             _check_unzipped(path)
-            _check_whole(path)
-            bodies = _bodies(trimesh.load_scene(path, process=False, **options), path)
+            text = _text(path)
+            source = path if text is None else BytesIO(text.encode())
+            scene = trimesh.load_scene(source, file_type=path.suffix[1:].lower(), process=False, **options)
+            bodies = _bodies(scene, path)
     except InputError:
         raise
     except Exception as error:  # trimesh's readers raise whatever their parsing runs into
@@ -104,18 +108,43 @@ def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, tri
     return bodies
 
 
-def _check_whole(path: Path) -> None:
-    """Raises `InputError` for a binary STL file whose size is not that of the triangles that it counts."""
-    if path.suffix.lower() != ".stl":
-        return
+def _text(path: Path) -> str | None:
+    """The text of an STL or OBJ file; None for other files and for binary STL.
+
+    Text that is not UTF-8 is Latin-1, as older CAD programs write names. Raises `InputError` for an STL file that is
+    cut off: of bodies that do not end trimesh says nothing.
+    """
+    if path.suffix.lower() not in (".stl", ".obj"):
+        return None
     with opened(path) as file:
-        head = file.read(84)
-    size = path.stat().st_size
-    if len(head) == 84 and b"\0" in head and size != 84 + 50 * (count := int.from_bytes(head[80:], "little")):
+        content = file.read()
+    if path.suffix.lower() == ".stl" and _is_binary(content, path):
+        return None
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if path.suffix.lower() == ".stl":
+        begun, ended = (len(re.findall(rf"^[ \t]*{word}\b", text, re.M | re.I)) for word in ("solid", "endsolid"))
+        if begun > ended:
+            raise InputError(f"{path}: has {begun} `solid` and {ended} `endsolid`: it is cut off. Export it anew.")
+        if re.search(r"vertex\s+[-+]?\d+,\d", text, re.I):
+            raise InputError(f"{path}: its numbers have a comma, and a decimal point was expected. Export it anew.")
+    return text
+
+
+def _is_binary(content: bytes, path: Path) -> bool:
+    """Whether an STL file is a binary one. Raises `InputError` if its size is not that of the triangles it counts."""
+    size, count = len(content), int.from_bytes(content[80:84], "little")
+    if size >= 84 and size == 84 + 50 * count:
+        return True
+    if size >= 84 and b"\0" in content[:84]:
         raise InputError(
             f"{path}: counts {count} triangles, which take {84 + 50 * count} bytes, and has {size}: it is cut off or "
             "damaged. Export it anew."
         )
+    return False
 
 
 def _check_unzipped(path: Path) -> None:

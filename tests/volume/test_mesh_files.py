@@ -111,3 +111,43 @@ def test_a_binary_stl_that_is_cut_off_or_too_long_is_told(tmp_path: Path, change
     (tmp_path / "device.stl").write_bytes(content[:change] if change < 0 else content + b"\0" * change)
     with pytest.raises(InputError, match=r"counts 12 triangles, which take 684 bytes, and has"):
         read_mesh(tmp_path / "device.stl")
+
+
+def ascii_stl(*names: str) -> str:
+    """A body of 20 mm for each name, one beside the other."""
+    text = ""
+    for n, name in enumerate(names):
+        body = trimesh.creation.box((20, 20, 20), transform=trimesh.transformations.translation_matrix([30 * n, 0, 0]))
+        text += f"solid {name}\n"
+        for corners, normal in zip(body.triangles, body.face_normals, strict=True):
+            text += f"facet normal {normal[0]} {normal[1]} {normal[2]}\nouter loop\n"
+            text += "".join(f"vertex {x:.3f} {y:.3f} {z:.3f}\n" for x, y, z in corners) + "endloop\nendfacet\n"
+        text += f"endsolid {name}\n"
+    return text
+
+
+@pytest.mark.parametrize("ends", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
+def test_text_of_any_program_is_read(tmp_path: Path, encoding: str, ends: str) -> None:
+    path = tmp_path / "device.stl"
+    path.write_bytes(ascii_stl("Gerät", "Hülse").replace("\n", ends).encode(encoding))
+    assert read_mesh(path).volume == pytest.approx(2 * 20**3)
+
+
+@pytest.mark.parametrize("kept", [0.4, 0.9])
+def test_an_stl_of_text_that_is_cut_off_is_told(tmp_path: Path, kept: float) -> None:
+    """trimesh leaves a body that does not end out, and says nothing: of two the device would have kept one."""
+    text = ascii_stl("handle", "sleeve")
+    (tmp_path / "device.stl").write_text(text[: int(kept * len(text))], encoding="utf-8")
+    with pytest.raises(InputError, match=r"has . `solid` and . `endsolid`: it is cut off"):
+        read_mesh(tmp_path / "device.stl")
+
+
+def test_numbers_with_a_comma_and_bytes_that_are_no_text(tmp_path: Path) -> None:
+    (tmp_path / "device.stl").write_text(ascii_stl("a").replace(".", ","), encoding="utf-8")
+    with pytest.raises(InputError, match="its numbers have a comma"):
+        read_mesh(tmp_path / "device.stl")
+    for name in ("noise.stl", "noise.obj"):
+        (tmp_path / name).write_bytes(np.random.default_rng(0).integers(1, 255, 3000).astype(np.uint8).tobytes())
+        with pytest.raises(InputError, match="the mesh holds no triangle"):
+            read_mesh(tmp_path / name)
