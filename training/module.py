@@ -17,8 +17,8 @@ from training.augmentation import Batch
 class OptimisationSettings:
     """AdamW over `epochs` of `batches_per_epoch` batches: a warm-up, a constant learning rate, and a cool-down.
 
-    Hägele et al. 2024 (arXiv 2405.18392) find it as good as a cosine's decay. A longer run starts as a shorter one does,
-    so that one that is resumed with more epochs before its cool-down equals one that was planned so from the start.
+    Hägele et al. 2024 (arXiv 2405.18392) find it as good as a cosine's decay. A longer run begins as a shorter one
+    does. So a run that is resumed with more epochs before its cool-down equals one that was planned so from the start.
     """
 
     epochs: int
