@@ -141,23 +141,22 @@ def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) ->
     seen = display.pixels_to_camera(picked if distortion is None else distortion.straight(picked), camera)
     spread = {mark.name: mark.spread_mm for mark in case.anatomy.landmarks} if case.anatomy is not None else {}
 
-    def fitted(called: Sequence[str], at: Tensor) -> PnpResult:
-        """The pose by places (N, 2) in the image, if they are the landmarks of these names."""
+    def fitted(called: Sequence[str], rows: Sequence[int]) -> PnpResult:
+        """The pose by these rows (N,) of what was picked, if they are the landmarks of these names."""
         return solve_pnp(
             torch.stack([case.landmarks[name] for name in called]).double(),
-            at,
+            seen[list(rows)],
             camera,
             deviations_px=torch.full((len(called),), GIVEN_DEVIATION_MM / camera.mean_pixel_mm, dtype=torch.float64),
             point_deviations_mm=torch.tensor([spread.get(name, 0.0) for name in called], dtype=torch.float64),
             beam=display.beam,
         )
 
-    pnp = fitted(names, seen)
+    pnp = fitted(names, range(len(names)))
     _check_rotation(pnp)
     _check_beam(pnp.camera_from_object, display)
-    left, back, _ = pnp.camera_from_object[2, :3].abs().tolist()
-    if left > back and case.anatomy is not None:
-        _check_sides(case.anatomy, case.landmarks, names, seen, fitted)
+    if case.anatomy is not None:
+        _check_sides(pnp, case.anatomy, case.landmarks, names, fitted)
     marks = {
         name: LandmarkRecord(_pair(pixels[name]), 1.0, True, inlier)
         for name, inlier in zip(names, pnp.inliers.tolist(), strict=True)
@@ -198,8 +197,23 @@ def find_start(
     usable = [i for i, name in enumerate(names) if name in landmarks and bool(detection.visible[i])]
     used = [names[i] for i in usable]
     points = torch.stack([landmarks[name] for name in used]).double() if used else torch.zeros(0, 3).double()
-    spread = torch.tensor(anatomy.landmark_spread_mm, dtype=torch.float64)[usable]
+    deviation_of = dict(zip(names, torch.tensor(anatomy.landmark_spread_mm, dtype=torch.float64), strict=True))
+    spread = torch.stack([deviation_of[name] for name in used]) if used else torch.zeros(0).double()
     pixels, deviations = detection.pixels[usable], detection.deviation_px[usable]
+
+    def fitted(called: Sequence[str], rows: Sequence[int]) -> PnpResult:
+        """The pose by these rows (N,) of what was found, if they are the landmarks of these names."""
+        there = list(rows)
+        return solve_pnp(
+            torch.stack([landmarks[name] for name in called]).double(),
+            pixels[there],
+            camera,
+            detection.confidence[usable][there],
+            deviations[there],
+            torch.stack([deviation_of[name] for name in called]),
+            beam,
+        )
+
     too_few: InputError | None = None
     try:
         if len(usable) < MINIMUM:
@@ -208,12 +222,14 @@ def find_start(
                 "is `intensity` of the view right (raw: bone dark, log: bone bright)? Otherwise give the landmarks by "
                 "hand (--landmarks)."
             )
-        pnp = solve_pnp(points, pixels, camera, detection.confidence[usable], deviations, spread, beam)
+        pnp = fitted(used, range(len(used)))
     except InputError as error:
         if outline is None or not usable or beam[1] == 0:  # the network does not know bones from a side
             raise
         too_few = error
         pnp = likely_pose(points, pixels, camera, deviations, spread, beam, detection.turned)
+    else:
+        _check_sides(pnp, anatomy, landmarks, used, fitted)
     if outline is None:
         _check_rotation(pnp)
         return Start(pnp.camera_from_object, pnp, used, None)
@@ -256,22 +272,27 @@ def _check_beam(camera_from_ct: Tensor, display: Display) -> None:
 
 
 def _check_sides(
+    pnp: PnpResult,
     anatomy: Anatomy,
     landmarks: Mapping[str, Tensor],
     names: Sequence[str],
-    seen: Tensor,
-    fitted: Callable[[Sequence[str], Tensor], PnpResult],
+    fitted: Callable[[Sequence[str], Sequence[int]], PnpResult],
 ) -> None:
-    """Raises `InputError` where landmarks (N, 2) that were picked in a view from a side may be those of the other side.
+    """Raises `InputError` where landmarks of a view from a side may be those of the other side.
+
+    `fitted` gives the pose if rows of what was seen are the landmarks of given names.
 
     From a side, a body and its mirror image cast nearly the same shadow, and only perspective tells them apart: picked
     with left and right exchanged, the landmarks of a pelvis gave poses 20° and 80 mm off, within 10 mm on the detector.
     """
+    left, back, _ = pnp.camera_from_object[2, :3].abs().tolist()
+    if left <= back:
+        return
     mirror = {mark.name: mark.mirror for mark in anatomy.landmarks}
     both = [n for n, name in enumerate(names) if mirror.get(name) in landmarks]
     own, other = [names[n] for n in both], [mirror[names[n]] for n in both]
     try:
-        gain = fitted(own, seen[both]).misfit - fitted(other, seen[both]).misfit
+        gain = fitted(own, both).misfit - fitted(other, both).misfit
     except InputError:  # too few of them, or none of the other side fits
         return
     if gain > -_SURE_OF_SIDES:

@@ -14,11 +14,12 @@ from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.case import Case, CaseObject, Model, Start, View, read_case, write_case
+from femoreg_torch.detect import Detection
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Circle, Display, write_image
 from femoreg_torch.geometry import Camera, CArm, exp_se3, project_points, rotation_angle, transform_points
 from femoreg_torch.registration.prepare import read_images
-from femoreg_torch.registration.start import start_by_landmarks
+from femoreg_torch.registration.start import find_start, start_by_landmarks
 
 float64 = torch.float64
 CAMERA = Camera(1000.0, (1.5, 1.4), (40, 50), (26.0, 18.0))  # as the source sees it; nothing of it is symmetric
@@ -151,6 +152,25 @@ def test_from_a_side_landmarks_with_left_and_right_exchanged_are_told(
     exchanged = dict(zip(HIP.landmark_names, seen.view(7, 2, 2).flip(1).flatten(0, 1), strict=True))
     with pytest.raises(InputError, match="with left and right exchanged they fit better"):
         start_by_landmarks(case, "pelvis", exchanged)
+
+
+@pytest.mark.parametrize("source", ["left", "right"])
+def test_from_a_side_the_networks_landmarks_with_left_and_right_exchanged_are_told(tmp_path: Path, source: str) -> None:
+    case, truth, seen = pelvis_under(tmp_path, Display(source), torch.eye(4, dtype=float64))  # type: ignore[arg-type]
+    camera, beam = case.carm.camera, case.display.beam
+    ones = torch.ones(len(HIP.landmarks), dtype=float64)
+    bones = torch.zeros(1 + len(HIP.bones), 96, 96)
+    detection = Detection(seen, ones, 2 * ones, ones > 0, bones, camera, False)
+
+    def start(found: Detection) -> torch.Tensor:
+        image = torch.zeros(camera.shape)
+        return find_start(case.landmarks, found, image, camera, None, HIP, beam=beam).camera_from_ct
+
+    turned = start(detection)[:3, :3] @ truth[:3, :3].mT
+    assert torch.rad2deg(rotation_angle(turned)) < 5
+    exchanged = seen.view(7, 2, 2).flip(1).flatten(0, 1)
+    with pytest.raises(InputError, match="exchanged they fit better|of 14 agree on a pose"):
+        start(replace(detection, pixels=exchanged))
 
 
 @pytest.mark.parametrize("said", ["anterior", "posterior"])
