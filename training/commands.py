@@ -21,8 +21,8 @@ def train(
     """Train the landmark and segmentation network and export its weights.
 
     Views are rendered once into the cache; a run that was stopped goes on with `--resume`. OUT holds the logs
-    (CSV and TensorBoard), checkpoints, and hip14.safetensors, the moving average of the weights at their best
-    validation loss.
+    (CSV and TensorBoard), checkpoints, curves.png, card.md, which says what it was trained on and how it went, and
+    hip14.safetensors, the moving average of the weights at their best validation loss.
 
     Args:
         settings: preset in configs/training (hip14, quick, grupp2020), or a YAML file, which may extend one.

@@ -28,6 +28,7 @@ from femoreg_torch.detect.grid import NETWORK_SIZE
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import clear_leftovers, temporary_file, write_json
 from models.weights import SHIPPED_WEIGHTS, Weights, save_weights
+from training.card import write_card
 from training.checkpoints import WholeCheckpoints, last_good_checkpoint, read_checkpoint
 from training.cohort import render_cohort
 from training.curves import draw_curves
@@ -140,7 +141,9 @@ def train_network(
     if not trainer.is_global_zero:  # one process writes
         return out / SHIPPED_WEIGHTS
     draw_curves(out / _TENSORBOARD, out / "curves.png")
-    return export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
+    weights = export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
+    write_card(out / "card.md", settings, cases, out / _TENSORBOARD)
+    return weights
 
 
 def _check_machine(machine: Machine) -> None:

@@ -99,6 +99,9 @@ def test_a_run_exports_weights_that_load_and_can_be_resumed(
     assert {path.stat().st_mode & 0o777 for path in (weights, *cache.iterdir())} == {usual_mode(tmp_path)}
     second = load_network(weights).module.state_dict()
     assert any(not torch.equal(first[name], second[name]) for name in first)
+    card = (out / "card.md").read_text(encoding="utf-8")
+    assert "4 steps of 2 images (8 images)" in card
+    assert f"| {case.name} | 2 | 6 | not told | not told |" in card
     views = ViewBatches(sorted(cache.glob("*_??.safetensors")), 2, read_settings(settings).run.augmentation, 1, 4)
     assert views[3].images.equal(views[3].images)
     assert not views[2].images.equal(views[3].images)
