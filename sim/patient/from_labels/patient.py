@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from femoreg_torch.anatomy import HIP, LabelTable
-from femoreg_torch.files import new_folder
+from femoreg_torch.files import new_folder, write_json
 from femoreg_torch.volume import Volume, read_label_map
 from sim.patient.from_labels.bones import skeleton_from_labels
 from sim.patient.landmarks import find_landmarks
@@ -44,8 +44,12 @@ def make_label_patient(labels: Volume, bones: LabelTable, seed: int, spacing_mm:
 def write_label_patient(path: Path, bones: LabelTable, out: Path, seed: int, spacing_mm: float = 1.0) -> None:
     """Write the patient of the label map in file `path` as folder `out`, whole or not at all.
 
+    It holds ct.nii.gz, labels.nii.gz, landmarks.json, and origin.json: what it is made from.
+
     Raises `InputError` as `read_label_map` and `make_label_patient` do.
     """
     patient = make_label_patient(read_label_map(path), bones, seed, spacing_mm)
     with new_folder(out) as folder:
         write_patient(folder, patient)
+        origin = {"source": path.name, "licence": "that of the label map", "seed": seed, "spacing_mm": spacing_mm}
+        write_json(folder / "origin.json", {"what": "synthetic CT: bones of a label map, invented HU", **origin})

@@ -1,5 +1,6 @@
 """Bones from thick slices against the shapes that the slices were cut from."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +127,7 @@ def test_the_patient_around_the_bones(labels: Volume, points: dict[str, NDArray[
     ct = read_ct(tmp_path / "case" / "ct.nii.gz")
     found = read_labels(tmp_path / "case" / "labels.nii.gz", ct)
     landmarks = read_landmarks(tmp_path / "case" / "landmarks.json")
+    assert json.loads((tmp_path / "case" / "origin.json").read_text(encoding="utf-8"))["source"] == "map.nii.gz"
     off = {name: float(np.linalg.norm(landmarks[name].numpy() - AWAY - point)) for name, point in points.items()}
     assert np.median(list(off.values())) < 2.5, off
     assert max(off.values()) < 8, off
