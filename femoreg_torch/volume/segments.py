@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import nibabel
 import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
@@ -163,6 +162,8 @@ def _nifti_segments(path: Path) -> list[Segment]:
     """The label table in the header of a NIfTI file; empty where there is none."""
     if not path.is_file() or not path.name.lower().endswith(_NIFTI_SUFFIXES):
         return []
+    import nibabel  # takes a tenth of a second, beside the reading of images
+
     try:
         image: Any = nibabel.load(path)  # its declared type is that of all formats
     except (nibabel.filebasedimages.ImageFileError, OSError, EOFError, ValueError, zlib.error):
