@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 import yaml
 
 from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.paths import check_readable
 
 MOST_YAML_BYTES = 2**20  # a case of a hundred views has a tenth of it
 MOST_JSON_BYTES = 2**26  # a result with the whole course of its optimisation has some 2**21
@@ -35,17 +36,13 @@ _NO_KEY = object()
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """The content of a regular file. Raises `InputError` if it is missing, cannot be read or holds more bytes."""
-    content = None
+    """The content of a file. Raises `InputError` as `check_readable` does, and if it holds more bytes."""
+    check_readable(path)
     try:
-        if path.is_file():
-            with path.open("rb") as file:
-                content = file.read(most + 1)
-    except (OSError, ValueError) as error:  # ValueError: a path with a null byte
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise InputError(f"{shortened(path)}: cannot be read ({reason}).") from error
-    if content is None:
-        raise InputError(f"{path}: no such file.")
+        with path.open("rb") as file:
+            content = file.read(most + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}).") from error
     if len(content) > most:
         raise InputError(
             f"{path}: is larger than {most / 2**20:g} MB, which no file of this kind is. Is it another one?"

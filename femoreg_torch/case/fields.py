@@ -11,6 +11,7 @@ from torch import Tensor
 from femoreg_torch.errors import InputError, in_mm, shortened
 from femoreg_torch.geometry import check_rigid, read_itk_transform
 from femoreg_torch.geometry.rigid import FARTHEST_MM
+from femoreg_torch.paths import why_unreadable
 
 _LONGEST_PATH = 120  # characters of the keys that lead to a value, in messages
 
@@ -130,19 +131,13 @@ class Fields:
         return torch.stack([items.transform(name) for name in items.content])
 
     def file_path(self, key: str, folder: Path, may_be_folder: bool = False) -> Path:
-        """The existing file under `key`, relative to `folder` unless absolute."""
+        """The file under `key` that can be read, relative to `folder` unless absolute."""
         value = self.value(key, "the path of a file")
         if not isinstance(value, str):
             raise InputError(f"{self.where(key)}: the path of a file was expected, found {shortened(value)}.")
-        path = folder / value
-        try:
-            there = path.is_file() or (may_be_folder and path.is_dir())
-        except (OSError, ValueError):  # a name that is too long, holds a null byte, or leads to itself
-            there = False
-        if not there:
-            raise InputError(
-                f"{self.where(key)}: there is no file {shortened(value, 200)}. Paths are relative to {self.file}."
-            )
+        path, expected = folder / value, "file or folder" if may_be_folder else "file"
+        if (why := why_unreadable(path, f"Paths are relative to {self.file}.", expected)) is not None:
+            raise InputError(f"{self.where(key)}: {shortened(value, 200)}: {why}")
         return path
 
     def _numbers(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:

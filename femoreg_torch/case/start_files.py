@@ -26,8 +26,6 @@ def read_pixels(path: Path) -> dict[str, Tensor]:
     files of the image plane: x is the column, y the row, in the space LPS. Raises `InputError` that names file and row.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
     if path.suffix.lower() != ".csv":
         return {name: point[:2] for name, point in read_landmarks(path, None).items()}
     rows = read_csv(path, COLUMNS)

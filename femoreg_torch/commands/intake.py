@@ -53,10 +53,12 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     from rich.console import Console
     from rich.markup import escape
 
+    from femoreg_torch.case import case_folder
     from femoreg_torch.case.start_files import read_pixels
     from femoreg_torch.commands.status import AMISS, DONE
     from femoreg_torch.intake import check_case
 
+    case = case_folder(case)
     _check_picture(out, case)
     console = Console(soft_wrap=True)
     pixels = None if landmarks is None else read_pixels(landmarks)

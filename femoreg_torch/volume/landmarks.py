@@ -133,8 +133,6 @@ def _plain_name(text: str) -> str:
 
 def _points(path: Path) -> list[tuple[str, Tensor]]:
     """Name and position (3,), LPS mm, of every point in a file, in its order. Raises `InputError`."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
     if path.suffix.lower() == ".fcsv":
         points = _fcsv_points(path)
     else:
