@@ -15,7 +15,7 @@ from femoreg_torch.case.fields import Fields
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import read_csv
 from femoreg_torch.registration.prepare import read_bones
-from femoreg_torch.text import read_yaml
+from femoreg_torch.text import read_yaml_and_lines
 from femoreg_torch.volume import read_landmarks
 
 COLUMNS = ("image", "bead", "column_px", "row_px")
@@ -49,7 +49,8 @@ def read_beads(path: Path, case: Case) -> Given:
     Raises `InputError` that names file and key.
     """
     path = Path(path)
-    top = Fields(read_yaml(path), str(path)).only("objects", "annotations", "image_noise_px", "views")
+    content, lines = read_yaml_and_lines(path)
+    top = Fields(content, str(path), lines=lines).only("objects", "annotations", "image_noise_px", "views")
     entries = top.mapping("objects")
     if not entries.content:
         raise InputError(f"{top.where('objects')}: is empty. Name at least one object with beads.")

@@ -17,7 +17,7 @@ from femoreg_torch.case.parts import (
 )
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.paths import why_unreadable
-from femoreg_torch.text import read_yaml
+from femoreg_torch.text import read_yaml_and_lines
 from femoreg_torch.volume import read_landmarks
 
 CASE_NAME = "case.yaml"
@@ -48,7 +48,8 @@ def read_fields(folder: Path) -> Fields:
         inside = sorted(other.parent.name for other in folder.glob(f"*/{CASE_NAME}"))
         meant = f"Its folders do: {shortened(', '.join(inside), 100)}. Name one." if inside else _MAKE
         raise InputError(f"{folder}: not a case folder, it holds no {CASE_NAME}. {meant}")
-    return Fields(read_yaml(path), str(path))
+    content, lines = read_yaml_and_lines(path)
+    return Fields(content, str(path), lines=lines)
 
 
 def read_case(folder: Path) -> Case:

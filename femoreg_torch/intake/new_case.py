@@ -14,7 +14,7 @@ from femoreg_torch.anatomy import HIP, LabelTable, label_table, label_table_name
 from femoreg_torch.case.femoroplasty import DEVICE, DEVICE_POINTS, FEMUR, TEMPLATE, femoral_head, operated_femur
 from femoreg_torch.case.model import Intensity, Side
 from femoreg_torch.case.nominal import ALONG_PATH, NominalPlace
-from femoreg_torch.case.reading import VERSIONS
+from femoreg_torch.case.reading import CASE_NAME, VERSIONS
 from femoreg_torch.case.writing import display_content
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import new_folder, plain, write_text
@@ -121,7 +121,8 @@ def _sources(content: dict[str, Any], given: NewCase) -> dict[str, Path]:
 
 
 def _as_given(problem: str, folder: Path, sources: dict[str, Path]) -> str:
-    """The problem with the files given in place of their copies in `folder`, which are not kept."""
+    """The problem with the files given in place of their copies in `folder`, which are not kept, nor is its form."""
+    problem = re.sub(rf"\b({CASE_NAME}), line \d+", r"\1", problem)
     copies = rf"({re.escape(str(folder))}/)?\b({'|'.join(map(re.escape, sources))})(?!\w)"
     return re.sub(copies, lambda found: str(sources[found[2]]) if found[1] else _short(sources[found[2]]), problem)
 
