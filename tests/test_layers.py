@@ -26,7 +26,7 @@ MAY_IMPORT = {
 # truth, so it comes late.
 ROOMS = (
     "errors", "paths", "yaml_faults", "text", "arrays", "tensors", "hdf5_entries", "hdf5", "cores", "exchange",
-    "pictures", "files", "extras", "configs", "settings", "extensions",
+    "pictures", "delimited", "files", "extras", "configs", "settings", "extensions",
     "anatomy", "geometry", "volume", "segment", "drr", "fluoro", "case",
     "detect", "pnp", "similarity", "optimize", "registration", "navigation", "neighbours", "planning",
     "evaluation", "review", "beads", "intake", "statistics", "commands", "__main__",

@@ -7,8 +7,9 @@ import pytest
 import yaml
 from femoreg_torch.configs import load_preset
 
+from femoreg_torch.delimited import read_csv
 from femoreg_torch.errors import InputError, in_mm, shortened
-from femoreg_torch.files import read_csv, read_json
+from femoreg_torch.files import read_json
 from femoreg_torch.text import json_content, read_yaml, yaml_content, yaml_mapping
 
 # 529 bytes that stand for 9¹¹ values

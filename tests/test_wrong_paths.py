@@ -13,9 +13,10 @@ from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.reading import case_folder
 from femoreg_torch.case.start_files import read_pixels
 from femoreg_torch.commands.main import main
+from femoreg_torch.delimited import read_csv
 from femoreg_torch.detect import load_network
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import read_csv, read_json
+from femoreg_torch.files import read_json
 from femoreg_torch.fluoro import read_image
 from femoreg_torch.geometry import load_carm, read_itk_transform
 from femoreg_torch.intake import inspect_path

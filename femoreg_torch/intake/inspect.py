@@ -40,7 +40,7 @@ from femoreg_torch.volume.segments import SEGMENTATION_SUFFIX
 
 _VOLUMES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".hdr")
 _MESHES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb", ".step", ".stp")
-_POINTS = (".fcsv", ".json")
+_POINTS = (".fcsv", ".json", ".csv", ".tsv")
 _TRANSFORMS = (".tfm", ".h5", ".mat")
 _PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _LISTED = 40  # entries of a folder
