@@ -111,6 +111,8 @@ def decoded(content: str | bytes, where: str, kind: str) -> str:
         return content
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(f"{where}: cannot be read as {kind}: it is UTF-16, or no text. Save it as UTF-8.")
+    if b"\0" in content:
+        raise InputError(f"{where}: cannot be read as {kind}: it holds bytes of 0, so is no text. Is it another file?")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

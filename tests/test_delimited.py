@@ -117,7 +117,8 @@ HEADER = "landmark,column_px,row_px\n"
         ("a.csv", "FH-l,1,2\nFH-r,1,2\n", "line 1: a header with landmark, column_px, row_px, .* found 'FH-l,1,2'"),
         ("a.csv", HEADER, "and rows below it, were expected, found no row"),
         ("a.csv", "landmark,row_px,column_px,row_px\nFH-l,1,2,3\n", "line 1: column 'row_px' stands there twice"),
-        ("a.csv", HEADER + "FH\x00l,1,2\n", r"line 2: cannot be read as CSV: the letter U\+0000 is no text"),
+        ("a.csv", HEADER + "FH\x07l,1,2\n", r"line 2: cannot be read as CSV: the letter U\+0007 is no text"),
+        ("a.csv", HEADER + "FH\x00l,1,2\n", "cannot be read as CSV: it holds bytes of 0"),
     ],
 )  # fmt: skip
 def test_tables_of_pixels_that_may_mean_something_else(name: str, text: str, told: str, tmp_path: Path) -> None:
