@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.paths import check_readable
 from femoreg_torch.text import MOST_YAML_BYTES, read_bytes, yaml_mapping
 
 _SUFFIXES = (".yaml", ".yml")
@@ -30,8 +31,7 @@ def load_preset(group: str, name: str | Path) -> dict[str, Any]:
 def _load(group: str, name: str, folder: Path, before: tuple[str, ...]) -> dict[str, Any]:
     if name.endswith(_SUFFIXES):
         path = folder / name
-        if not path.is_file():
-            raise InputError(f"{path}: no such file. Give a YAML file or a preset: {', '.join(preset_names(group))}.")
+        check_readable(path, f"Give a YAML file or a preset: {', '.join(preset_names(group))}.")
         where, folder = str(path), path.parent
         text = read_bytes(path, MOST_YAML_BYTES)
     elif name in (known := preset_names(group)):

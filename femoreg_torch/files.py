@@ -1,10 +1,8 @@
-"""Files and folders that appear whole or not at all, whatever happens to the run that writes them; JSON and CSV."""
+"""Files and folders that appear whole or not at all, whatever happens to the run that writes them; JSON."""
 
-import csv
 import errno
 import fcntl
 import glob
-import io
 import json
 import math
 import os
@@ -324,16 +322,3 @@ def read_json(path: Path, with_nan: bool = False) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{path}: a JSON object {{…}} was expected, found {type(content).__name__}.")
     return content
-
-
-def read_csv(path: Path, columns: Collection[str]) -> list[dict[str, str]]:
-    """The rows of a CSV file by its header, which must hold these columns. Raises `InputError` that names the file."""
-    try:
-        text = read_bytes(path, MOST_JSON_BYTES).decode("utf-8-sig")
-        rows = list(csv.DictReader(io.StringIO(text, newline="")))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as CSV ({error}).") from error
-    if not rows or not set(columns) <= set(rows[0]):
-        header = f"a header with {', '.join(columns)}" if columns else "a header"
-        raise InputError(f"{path}: {header}, and rows below it, were expected.")
-    return rows

@@ -25,6 +25,7 @@ from torch import Tensor
 from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError, defect_in_one_line
 from femoreg_torch.hdf5_entries import QUESTIONS, opened
+from femoreg_torch.paths import check_readable
 
 _LEAST_CPU_S, _SLOWEST = 2, 10 * 2**20  # for a question: seconds, and one more for so many bytes of the file
 _SHARE_OF_MEMORY = 0.5
@@ -94,8 +95,7 @@ class Hdf5File:
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Hdf5File]:
     """An HDF5 file for reading. Raises `InputError` if it is missing, or, when it is asked, is something else."""
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file.")
+    check_readable(Path(path))
     ours, theirs = Pipe()
     with quiet():  # Python warns of forks beside threads; the child has no need of them
         child = os.fork()

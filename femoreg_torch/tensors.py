@@ -8,6 +8,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.paths import check_readable
 
 
 def read_tensors(path: Path, names: Sequence[str] | None = None) -> tuple[dict[str, str], dict[str, Tensor]]:
@@ -15,8 +16,7 @@ def read_tensors(path: Path, names: Sequence[str] | None = None) -> tuple[dict[s
 
     Raises `InputError` if the file is missing, cut off, of another kind, or lacks one of them.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
+    check_readable(path)
     try:
         with safe_open(path, "pt") as content:
             there = list(content.keys())

@@ -17,6 +17,8 @@ from typing import Any, NoReturn
 import yaml
 
 from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.paths import check_readable
+from femoreg_torch.yaml_faults import ESCAPES, fault, fault_of_key, is_escaped_path, missing_space
 
 MOST_YAML_BYTES = 2**20  # a case of a hundred views has a tenth of it
 MOST_JSON_BYTES = 2**26  # a result with the whole course of its optimisation has some 2**21
@@ -35,17 +37,13 @@ _NO_KEY = object()
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """The content of a regular file. Raises `InputError` if it is missing, cannot be read or holds more bytes."""
-    content = None
+    """The content of a file. Raises `InputError` as `check_readable` does, and if it holds more bytes."""
+    check_readable(path)
     try:
-        if path.is_file():
-            with path.open("rb") as file:
-                content = file.read(most + 1)
-    except (OSError, ValueError) as error:  # ValueError: a path with a null byte
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise InputError(f"{shortened(path)}: cannot be read ({reason}).") from error
-    if content is None:
-        raise InputError(f"{path}: no such file.")
+        with path.open("rb") as file:
+            content = file.read(most + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}).") from error
     if len(content) > most:
         raise InputError(
             f"{path}: is larger than {most / 2**20:g} MB, which no file of this kind is. Is it another one?"
@@ -58,14 +56,26 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return yaml_mapping(read_bytes(path, MOST_YAML_BYTES), str(path))
 
 
+def read_yaml_and_lines(path: Path) -> tuple[dict[str, Any], dict[str, int]]:
+    """As `read_yaml`, and the line of each key and list item, by names like `views[0].anatomy`."""
+    return _mapping_and_lines(read_bytes(path, MOST_YAML_BYTES), str(path))
+
+
 def yaml_mapping(text: str | bytes, where: str) -> dict[str, Any]:
     """The mapping that a YAML text holds. Raises `InputError` as `yaml_content` does, and if it holds another thing."""
-    content = yaml_content(text, where)
+    return _mapping_and_lines(text, where)[0]
+
+
+def _mapping_and_lines(text: str | bytes, where: str) -> tuple[dict[str, Any], dict[str, int]]:
+    built = _built(text, where)
+    content = built.content
     if content is None:
         raise InputError(f"{where}: is empty, a mapping of keys and values was expected.")
+    if isinstance(content, str) and (found := missing_space(decoded(text, where, "YAML"))) is not None:
+        raise InputError(f"{where}, line {found[0]}: {found[1]}")
     if not isinstance(content, dict):
         raise InputError(f"{where}: a mapping of keys and values was expected, found {type(content).__name__}.")
-    return content
+    return content, built.lines
 
 
 def yaml_content(text: str | bytes, where: str) -> Any:
@@ -74,16 +84,42 @@ def yaml_content(text: str | bytes, where: str) -> Any:
     Raises `InputError` that starts with `where` for what is no YAML, is larger or deeper than any file of ours, has a
     tag, two equal keys, an endless alias, nan, or a whole number of more than 18 digits.
     """
+    return _built(text, where).content
+
+
+def _built(text: str | bytes, where: str) -> "_Builder":
     if len(text) > MOST_YAML_BYTES:
         raise InputError(f"{where}: is larger than {MOST_YAML_BYTES / 2**20:g} MB, which no file of this kind is.")
-    builder = _Builder(where)
+    builder, text = _Builder(where), decoded(text, where, "YAML")
     try:
-        text = text.decode("utf-8-sig") if isinstance(text, bytes) else text
         for event in yaml.parse(text, Loader=_Loader):
             builder.take(event)
+    except yaml.MarkedYAMLError as error:
+        line, told = fault(text, error)
+        raise InputError(f"{where}, line {line}: cannot be read as YAML: {told}") from error
     except (yaml.YAMLError, UnicodeError) as error:  # PyYAML encodes what it is given: lone surrogates are an error too
-        raise InputError(f"{where}: cannot be read as YAML ({_reason(error)[:200]}).") from error
-    return builder.content
+        raise InputError(f"{where}: cannot be read as YAML ({' '.join(str(error).split())[:200]}).") from error
+    return builder
+
+
+def decoded(content: str | bytes, where: str, kind: str) -> str:
+    """Text of a file of this kind, which is to be UTF-8, with or without a mark at its beginning.
+
+    Raises `InputError` that starts with `where` and tells the line of the first byte that is none of UTF-8.
+    """
+    if isinstance(content, str):
+        return content
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError(f"{where}: cannot be read as {kind}: it is UTF-16, or no text. Save it as UTF-8.")
+    if b"\0" in content:
+        raise InputError(f"{where}: cannot be read as {kind}: it holds bytes of 0, so is no text. Is it another file?")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line, byte = content[: error.start].count(b"\n") + 1, content[error.start]
+        raise InputError(
+            f"{where}, line {line}: cannot be read as {kind}: the byte 0x{byte:02X} is none of UTF-8. Save it as UTF-8."
+        ) from error
 
 
 def check_no_aliases(text: str, where: str) -> None:
@@ -100,22 +136,16 @@ def check_no_aliases(text: str, where: str) -> None:
             raise InputError(f"{where}: {shortened(text)} holds aliases (*), a plain value was expected.")
 
 
-def _reason(error: Exception) -> str:
-    """What PyYAML complains of, and the line."""
-    if isinstance(error, yaml.MarkedYAMLError):
-        line = "" if error.problem_mark is None else f", line {error.problem_mark.line + 1}"
-        return f"{error.problem or error.context}{line}"
-    return " ".join(str(error).split())
-
-
 @dataclass(eq=False)
 class _Open:
     """A list or mapping whose end has not been read."""
 
     value: dict[str, Any] | list[Any]
     anchor: str | None = None
+    path: str = ""  # the keys and numbers that lead to it
     size: int = 1  # values, those inside counted
     key: Any = _NO_KEY  # the key that waits for its value
+    key_is_plain: bool = False  # without quotes
 
 
 class _Builder:
@@ -124,6 +154,7 @@ class _Builder:
     def __init__(self, where: str) -> None:
         self.where = where
         self.content: Any = None
+        self.lines: dict[str, int] = {}  # by path
         self._open: list[_Open] = []
         self._anchors: dict[str, tuple[Any, int]] = {}  # values and their sizes
         self._documents = 0
@@ -149,13 +180,23 @@ class _Builder:
         if event.tag is not None:
             self._refuse(f"tag {shortened(event.tag)}: plain values without tags were expected")
         if isinstance(event, yaml.ScalarEvent):
-            self._put(self._scalar(event), 1, event.anchor)
+            self._put(self._scalar(event), 1, event.anchor, plain=event.implicit[0])
             return
         if len(self._open) == _DEEPEST:
             self._refuse(f"lists and mappings stand more than {_DEEPEST} deep in one another")
-        self._open.append(_Open({} if isinstance(event, yaml.MappingStartEvent) else [], event.anchor))
+        path = self._path() if self._open else ""
+        self._open.append(_Open({} if isinstance(event, yaml.MappingStartEvent) else [], event.anchor, path))
 
-    def _put(self, value: Any, size: int, anchor: str | None) -> None:
+    def _path(self) -> str:
+        """The path of the value that comes next; that of a list item gets its line."""
+        inside = self._open[-1]
+        if isinstance(inside.value, dict):
+            return f"{inside.path}.{inside.key}" if inside.path else str(inside.key)
+        path = f"{inside.path}[{len(inside.value)}]"
+        self.lines[path] = self._line
+        return path
+
+    def _put(self, value: Any, size: int, anchor: str | None, plain: bool = False) -> None:
         """A whole value into the list or mapping that it stands in."""
         if anchor is not None:
             self._anchors[anchor] = value, size
@@ -169,21 +210,30 @@ class _Builder:
         if isinstance(inside.value, list):
             inside.value.append(value)
         elif inside.key is _NO_KEY:
-            inside.key = self._key(value, inside.value)
+            inside.key, inside.key_is_plain = self._key(value, inside, plain), plain
         else:
+            if value is None and inside.key_is_plain and (found := missing_space(inside.key)) is not None:
+                self._refuse(found[1].rstrip("."))
             inside.value[inside.key] = value
             inside.key = _NO_KEY
 
-    def _key(self, value: Any, inside: dict[str, Any]) -> str:
+    def _key(self, value: Any, inside: _Open, plain: bool) -> str:
         if not isinstance(value, str | int | float) or isinstance(value, bool):
             self._refuse(f"key {shortened(value)}: keys of text were expected")
-        if str(value) in inside:
-            self._refuse(f"key {shortened(value)} stands there twice. Keep one")
-        return str(value)
+        key = str(value)
+        path = f"{inside.path}.{key}" if inside.path else key
+        if key in inside.value:
+            self._refuse(f"key {shortened(value)} stands there twice, first in line {self.lines[path]}. Keep one")
+        if plain and (wrong := fault_of_key(key)) is not None:
+            self._refuse(wrong)
+        self.lines[path] = self._line
+        return key
 
     def _scalar(self, event: yaml.ScalarEvent) -> Any:
         text = event.value
         if not event.implicit[0]:  # quoted
+            if event.style == '"' and is_escaped_path(text):
+                self._refuse(f"{shortened(text)}: {ESCAPES}")
             return text
         if _NULL.fullmatch(text):
             return None
@@ -234,13 +284,15 @@ def json_content(text: str | bytes, where: str, with_nan: bool = False) -> Any:
         raise InputError(f"{where}: is empty, JSON was expected.")
     try:
         content = json.loads(
-            text.decode("utf-8-sig") if isinstance(text, bytes) else text,
+            decoded(text, where, "JSON"),
             object_pairs_hook=_each_key_once,
             parse_int=_whole,
             parse_float=float if with_nan else _finite,
             parse_constant=float if with_nan else _not_finite,
         )
-    except ValueError as error:  # JSONDecodeError and UnicodeDecodeError among them
+    except InputError:
+        raise
+    except ValueError as error:  # JSONDecodeError among them
         raise InputError(f"{where}: cannot be read as JSON ({shortened(error, 160)}).") from error
     except RecursionError:
         raise InputError(f"{where}: lists and objects stand more than {_DEEPEST} deep in one another.") from None

@@ -105,10 +105,12 @@ def simulate(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+    from femoreg_torch.case import case_folder
     from femoreg_torch.commands.telling import tell_device
     from femoreg_torch.files import check_new_folder
     from sim.theatre.case_folders import SIMULATION_STEPS, write_simulation
 
+    case = case_folder(case)
     check_new_folder(out, case)
     console = Console()
     place = tell_device(console, device)

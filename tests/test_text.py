@@ -7,8 +7,9 @@ import pytest
 import yaml
 from femoreg_torch.configs import load_preset
 
+from femoreg_torch.delimited import read_csv
 from femoreg_torch.errors import InputError, in_mm, shortened
-from femoreg_torch.files import read_csv, read_json
+from femoreg_torch.files import read_json
 from femoreg_torch.text import json_content, read_yaml, yaml_content, yaml_mapping
 
 # 529 bytes that stand for 9¹¹ values
@@ -86,7 +87,7 @@ def test_what_is_not_plain_is_refused_at_once(text: str | bytes, message: str) -
         ('{"a": 1, "a": 2}', "key 'a' stands there twice"),
         (b"\xff", "cannot be read as JSON"),
         ('{"a": 1,}', "cannot be read as JSON"),
-        ("", "is empty, JSON was expected"),
+        ("", "is empty"),
         (" \n", "is empty, JSON was expected"),
     ],
 )

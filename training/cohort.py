@@ -120,7 +120,8 @@ def _check_names(cases: Sequence[Path]) -> None:
 
 
 def _of_case(folder: Path, settings: CohortSettings, report: Callable[[str], None]) -> Source:
-    files, name = find_patient(folder), folder.resolve().name
+    files = find_patient(folder)
+    name = files.folder.resolve().name
     told = {"case": name, "files": files.fingerprint()}
     return Source(name, f"case_{name}", told, settings.case_variants, partial(_read_case, name, files, report))
 

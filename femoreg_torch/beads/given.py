@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from scipy import ndimage
@@ -12,10 +11,10 @@ from femoreg_torch.beads.ct import find_beads
 from femoreg_torch.beads.model import Beads, check_beads, check_count
 from femoreg_torch.case import Case
 from femoreg_torch.case.fields import Fields
+from femoreg_torch.delimited import check_decimal_marks, decimal, read_csv
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.files import read_csv
 from femoreg_torch.registration.prepare import read_bones
-from femoreg_torch.text import read_yaml
+from femoreg_torch.text import read_yaml_and_lines
 from femoreg_torch.volume import read_landmarks
 
 COLUMNS = ("image", "bead", "column_px", "row_px")
@@ -49,7 +48,8 @@ def read_beads(path: Path, case: Case) -> Given:
     Raises `InputError` that names file and key.
     """
     path = Path(path)
-    top = Fields(read_yaml(path), str(path)).only("objects", "annotations", "image_noise_px", "views")
+    content, lines = read_yaml_and_lines(path)
+    top = Fields(content, str(path), lines=lines).only("objects", "annotations", "image_noise_px", "views")
     entries = top.mapping("objects")
     if not entries.content:
         raise InputError(f"{top.where('objects')}: is empty. Name at least one object with beads.")
@@ -142,6 +142,7 @@ def read_marks(path: Path, names: list[str], case: Case) -> dict[str, tuple[Mark
     of the first one. Raises `InputError` that names file and line.
     """
     rows = read_csv(path, COLUMNS)
+    check_decimal_marks(rows, COLUMNS[2:], str(path))
     names_of_images = [image.name for view in case.views for image in view.images.values()]
     if repeated := sorted({name for name in names_of_images if names_of_images.count(name) > 1}):
         raise InputError(
@@ -152,17 +153,18 @@ def read_marks(path: Path, names: list[str], case: Case) -> dict[str, tuple[Mark
     images |= {Path(name).stem: name for name in images}
     rows_px, columns_px = case.carm.camera.shape
     found: dict[str, list[Mark]] = {}
-    for line, row in enumerate(rows, 2):
-        image = images.get((row["image"] or "").strip())
+    for row in rows:
+        line, values = row.line, row.values
+        image = images.get(values["image"])
         if image is None:
             raise InputError(
-                f"{path}, line {line}: the case has no image {shortened(row['image'])}, but {', '.join(images)}."
+                f"{path}, line {line}: the case has no image {shortened(values['image'])}, but {', '.join(images)}."
             )
-        bead = (row["bead"] or "").strip() or None
+        bead = values["bead"] or None
         if bead is not None and bead not in names:
             raise InputError(f"{path}, line {line}: there is no bead {shortened(bead)}, but {', '.join(names)}.")
         column, height = (
-            _pixel(row[key], size, f"{path}, line {line}, {key}")
+            _pixel(values[key], size, f"{path}, line {line}, {key}")
             for key, size in (("column_px", columns_px), ("row_px", rows_px))
         )
         marks = found.setdefault(image, [])
@@ -172,10 +174,10 @@ def read_marks(path: Path, names: list[str], case: Case) -> dict[str, tuple[Mark
     return {image: tuple(marks) for image, marks in found.items()}
 
 
-def _pixel(value: Any, size: int, where: str) -> float:
+def _pixel(value: str, size: int, where: str) -> float:
     try:
-        number = float(value)
-    except (TypeError, ValueError):
+        number = decimal(value)
+    except ValueError:
         number = float("nan")
     if not -0.5 <= number <= size - 0.5:
         raise InputError(f"{where}: a pixel of the image from 0 to {size - 1} was expected, found {shortened(value)}.")

@@ -14,6 +14,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import PAPER_METRICS, errors
 from femoreg_torch.evaluation.fit import check_fits
 from femoreg_torch.files import read_json
+from femoreg_torch.paths import check_readable
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,7 @@ def read_trials(folder: Path, run: str = "run") -> list[Trial]:
 
     Raises `InputError` for a folder without any, or a trial without a result.
     """
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder.")
+    check_readable(folder, expected="folder")
     places = sorted(place for place in folder.iterdir() if (place / UNCERTAINTY_NAME).is_file())
     if not places:
         raise InputError(

@@ -2,7 +2,7 @@
 
 from femoreg_torch.case.model import Case, CaseObject, Model, Part, PlannedPath, Side, Start, View
 from femoreg_torch.case.quality import CameraQuality, ObjectQuality, ViewQuality
-from femoreg_torch.case.reading import read_case
+from femoreg_torch.case.reading import case_folder, read_case
 from femoreg_torch.case.result import LandmarkRecord, Result, StartRecord
 from femoreg_torch.case.result_file import RESULT_NAME, read_result, result_content
 from femoreg_torch.case.trace import StageRecord
@@ -28,6 +28,7 @@ __all__ = [
     "Verdict",
     "View",
     "ViewQuality",
+    "case_folder",
     "new_folder",
     "read_case",
     "read_result",

@@ -1,7 +1,7 @@
 """Reading fields of a YAML or JSON mapping with errors that name file, key, what was found and what was expected."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +11,26 @@ from torch import Tensor
 from femoreg_torch.errors import InputError, in_mm, shortened
 from femoreg_torch.geometry import check_rigid, read_itk_transform
 from femoreg_torch.geometry.rigid import FARTHEST_MM
+from femoreg_torch.paths import Expected, why_unreadable
+from femoreg_torch.yaml_faults import missing_space
 
 _LONGEST_PATH = 120  # characters of the keys that lead to a value, in messages
 
 
 @dataclass(frozen=True)
 class Fields:
-    """A mapping and where it stands: the file, and the keys that lead to it."""
+    """A mapping and where it stands: the file, the keys that lead to it, and the lines of all keys of a YAML file."""
 
     content: dict[str, Any]
     file: str
     path: str = ""
+    lines: Mapping[str, int] = field(default_factory=dict)  # by path
 
     def where(self, key: str) -> str:
-        """`file, path.to.key`, the beginning of every message."""
+        """`file, line 3, path.to.key`, the beginning of every message; the line where it is known."""
         path = f"{self.path}.{key}" if self.path else key
-        return f"{self.file}, {path if len(path) <= _LONGEST_PATH else path[: _LONGEST_PATH - 1] + '…'}"
+        line = f"line {self.lines[path]}, " if path in self.lines else ""
+        return f"{self.file}, {line}{path if len(path) <= _LONGEST_PATH else path[: _LONGEST_PATH - 1] + '…'}"
 
     def only(self, *known: str) -> "Fields":
         """Itself, if no key stands in it that is not `known`."""
@@ -48,29 +52,40 @@ class Fields:
         """The mapping under `key`."""
         value = self.value(key, "a mapping")
         if not isinstance(value, dict):
-            raise InputError(f"{self.where(key)}: a mapping of keys and values was expected, found {shortened(value)}.")
-        return Fields(value, self.file, f"{self.path}.{key}" if self.path else key)
+            raise InputError(
+                f"{self.where(key)}: a mapping of keys and values was expected, found {shortened(value)}."
+                f"{_mended(value)}"
+            )
+        return self.inside(value, key)
+
+    def inside(self, content: dict[str, Any], key: str = "") -> "Fields":
+        """A mapping that stands under `key`; without a key other content in its own place."""
+        return replace(self, content=content, path=f"{self.path}.{key}" if self.path and key else self.path or key)
 
     def mappings(self, key: str) -> list["Fields"]:
         """The list of mappings under `key`."""
         value = self.value(key, "a list")
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-            raise InputError(f"{self.where(key)}: a list of mappings was expected, found {shortened(value)}.")
-        prefix = f"{self.path}.{key}" if self.path else key
-        return [Fields(item, self.file, f"{prefix}[{n}]") for n, item in enumerate(value)]
+            raise InputError(
+                f"{self.where(key)}: a list of mappings was expected, found {shortened(value)}."
+                f"{_mended(value, _AS_LIST)}"
+            )
+        return [self.inside(item, f"{key}[{n}]") for n, item in enumerate(value)]
 
     def choice(self, key: str, allowed: Sequence[str]) -> str:
         """One of the `allowed` words under `key`."""
         value = self.value(key, " or ".join(allowed))
         if value not in allowed:
-            raise InputError(f"{self.where(key)}: {' or '.join(allowed)} was expected, found {shortened(value)}.")
+            raise InputError(
+                f"{self.where(key)}: {' or '.join(allowed)} was expected, found {shortened(value)}.{_mended(value)}"
+            )
         return value
 
     def text(self, key: str, expected: str) -> str:
         """The text under `key`; `expected` says in words what should stand there."""
         value = self.value(key, expected)
         if not isinstance(value, str) or not value:
-            raise InputError(f"{self.where(key)}: {expected} was expected, found {shortened(value)}.")
+            raise InputError(f"{self.where(key)}: {expected} was expected, found {shortened(value)}.{_mended(value)}")
         return value
 
     def texts(self, key: str, expected: str) -> list[str]:
@@ -126,23 +141,20 @@ class Fields:
         value = self.value(key, "a list of 4×4 matrices")
         if not isinstance(value, list) or not value:
             raise InputError(f"{self.where(key)}: a list of 4×4 matrices was expected, found {shortened(value)}.")
-        items = Fields({f"{key}[{n}]": item for n, item in enumerate(value)}, self.file, self.path)
+        items = self.inside({f"{key}[{n}]": item for n, item in enumerate(value)})
         return torch.stack([items.transform(name) for name in items.content])
 
     def file_path(self, key: str, folder: Path, may_be_folder: bool = False) -> Path:
-        """The existing file under `key`, relative to `folder` unless absolute."""
+        """The file under `key` that can be read, relative to `folder` unless absolute."""
         value = self.value(key, "the path of a file")
         if not isinstance(value, str):
-            raise InputError(f"{self.where(key)}: the path of a file was expected, found {shortened(value)}.")
-        path = folder / value
-        try:
-            there = path.is_file() or (may_be_folder and path.is_dir())
-        except (OSError, ValueError):  # a name that is too long, holds a null byte, or leads to itself
-            there = False
-        if not there:
             raise InputError(
-                f"{self.where(key)}: there is no file {shortened(value, 200)}. Paths are relative to {self.file}."
+                f"{self.where(key)}: the path of a file was expected, found {shortened(value)}.{_mended(value)}"
             )
+        path = folder / value
+        expected: Expected = "file or folder" if may_be_folder else "file"
+        if (why := why_unreadable(path, f"Paths are relative to {self.file}.", expected)) is not None:
+            raise InputError(f"{self.where(key)}: {shortened(value, 200)}: {why}")
         return path
 
     def _numbers(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:
@@ -153,6 +165,18 @@ class Fields:
         if numbers.shape != shape or not torch.isfinite(numbers).all():
             raise InputError(f"{self.where(key)}: {expected} was expected, found {shortened(value)}.")
         return numbers
+
+
+_AS_LIST = " Begin each of its entries with `- `."
+
+
+def _mended(value: Any, otherwise: str = "") -> str:
+    """A sentence on how to mend a value of the wrong kind, where it is known."""
+    if isinstance(value, str) and (found := missing_space(value)) is not None:
+        return f" Is it {found[1].partition('Write ')[2].rstrip('.')}, with a space?"
+    if isinstance(value, list) and not otherwise:
+        return " Write the value without brackets or dash."
+    return otherwise if isinstance(value, dict) else ""
 
 
 def _fits(value: Any, shape: tuple[int, ...]) -> bool:

@@ -223,7 +223,7 @@ def read_field(view: Fields, folder: Path) -> Circle | Polygon | Path | None:
     corners = field.value("polygon", "a list of corners [column, row]")
     if not isinstance(corners, list) or len(corners) < 3:
         raise InputError(f"{field.where('polygon')}: at least three corners [column, row] were expected.")
-    items = Fields({f"polygon[{n}]": corner for n, corner in enumerate(corners)}, field.file, field.path)
+    items = field.inside({f"polygon[{n}]": corner for n, corner in enumerate(corners)})
     pairs = (items.numbers(name, 2) for name in items.content)
     return Polygon(tuple((column, row) for column, row in pairs))
 

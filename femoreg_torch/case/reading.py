@@ -16,30 +16,48 @@ from femoreg_torch.case.parts import (
     with_known_poses,
 )
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.text import read_yaml
+from femoreg_torch.paths import why_unreadable
+from femoreg_torch.text import read_yaml_and_lines
 from femoreg_torch.volume import read_landmarks
 
+CASE_NAME = "case.yaml"
 VERSIONS = (1, 2)
+_MAKE = "Make a case with `femoreg new-case` or `femoreg simulate`."
 _KEYS = ("version", "anatomy", "ct", "landmarks", "objects", "plan", "carm", "display", "views", "truth")
 
 
+def case_folder(path: Path) -> Path:
+    """The folder that is meant by the path of a case: that folder, or the one in which this `case.yaml` stands.
+
+    Raises `InputError` for another file, and for what is missing or cannot be read.
+    """
+    path = Path(path)
+    if path.name == CASE_NAME and path.is_file():
+        return path.parent
+    beside = f"Name the folder {path.parent}." if (path.parent / CASE_NAME).is_file() else _MAKE
+    if (why := why_unreadable(path, beside, "folder")) is not None:
+        raise InputError(f"{path}: {why}")
+    return path
+
+
 def read_fields(folder: Path) -> Fields:
-    """The mapping in `case.yaml`. Raises `InputError` if it is missing or something else."""
-    path = folder / "case.yaml"
+    """The mapping in `case.yaml`. Raises `InputError` as `case_folder` does, and if it is missing or something else."""
+    folder = case_folder(folder)
+    path = folder / CASE_NAME
     if not path.is_file():
-        raise InputError(
-            f"{folder}: not a case folder, it holds no case.yaml. Make one with `femoreg new-case` or "
-            "`femoreg simulate`."
-        )
-    return Fields(read_yaml(path), str(path))
+        inside = sorted(other.parent.name for other in folder.glob(f"*/{CASE_NAME}"))
+        meant = f"Its folders do: {shortened(', '.join(inside), 100)}. Name one." if inside else _MAKE
+        raise InputError(f"{folder}: not a case folder, it holds no {CASE_NAME}. {meant}")
+    content, lines = read_yaml_and_lines(path)
+    return Fields(content, str(path), lines=lines)
 
 
 def read_case(folder: Path) -> Case:
-    """The case whose `case.yaml` stands in `folder`. Images and volumes are not opened yet, but must exist.
+    """The case of the `case.yaml` in `folder`, or of that file itself. Images and volumes are only looked for.
 
     Raises `InputError` that names file and key for anything missing, unknown or of another kind than expected.
     """
-    folder = Path(folder)
+    folder = case_folder(folder)
     top = read_fields(folder)
     if read_version(top) == 1:
         return femoroplasty_form.read_version_1(top, folder)

@@ -293,7 +293,7 @@ def _several(fields: Fields, key: str, count: int) -> Any:
     value = fields.content[key]
     if not isinstance(value, list) or len(value) != count:
         raise InputError(f"{fields.where(key)}: {count} numbers were expected.")
-    items = Fields({f"{key}[{n}]": item for n, item in enumerate(value)}, fields.file, fields.path)
+    items = fields.inside({f"{key}[{n}]": item for n, item in enumerate(value)})
     return tuple(_number(items, name) for name in items.content)
 
 

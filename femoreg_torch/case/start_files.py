@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.case.fields import Fields
+from femoreg_torch.delimited import check_decimal_marks, decimal, read_csv
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.files import read_csv, read_json
+from femoreg_torch.files import read_json
 from femoreg_torch.volume import read_landmarks
 
 COLUMNS = ("landmark", "column_px", "row_px")
@@ -26,19 +27,20 @@ def read_pixels(path: Path) -> dict[str, Tensor]:
     files of the image plane: x is the column, y the row, in the space LPS. Raises `InputError` that names file and row.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
     if path.suffix.lower() != ".csv":
         return {name: point[:2] for name, point in read_landmarks(path, None).items()}
     rows = read_csv(path, COLUMNS)
-    if len(images := {row.get("image") for row in rows}) > 1:
+    check_decimal_marks(rows, COLUMNS[1:], str(path))
+    if len(images := {row.values.get("image") for row in rows}) > 1:
         raise InputError(f"{path}: holds landmarks of {len(images)} images. Keep the rows of the first view.")
     found: dict[str, Tensor] = {}
-    for number, row in enumerate(rows, 2):
-        name = row["landmark"]
-        visible = _VISIBLE.get((row.get("visible") or "1").strip().lower())
+    for row in rows:
+        number, name = row.line, row.values["landmark"]
+        visible = _VISIBLE.get((row.values.get("visible") or "1").lower())
         if visible is None:
-            raise InputError(f"{path}, line {number}: visible: 1 or 0 was expected, found {shortened(row['visible'])}.")
+            raise InputError(
+                f"{path}, line {number}: visible: 1 or 0 was expected, found {shortened(row.values['visible'])}."
+            )
         if not visible:
             continue
         if not name or name in found:
@@ -46,8 +48,8 @@ def read_pixels(path: Path) -> dict[str, Tensor]:
                 f"{path}, line {number}: the name of a landmark was expected, each once; found {shortened(name)}."
             )
         try:
-            pixel = torch.tensor([float(row["column_px"]), float(row["row_px"])], dtype=torch.float64)
-        except (TypeError, ValueError):
+            pixel = torch.tensor([decimal(row.values[key]) for key in COLUMNS[1:]], dtype=torch.float64)
+        except ValueError:
             pixel = torch.full((2,), torch.nan)
         if not torch.isfinite(pixel).all() or pixel.abs().max() > _FARTHEST_PX:
             raise InputError(f"{path}, line {number}: two finite numbers, column_px and row_px, were expected.")

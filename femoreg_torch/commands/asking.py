@@ -15,7 +15,7 @@ from femoreg_torch.volume import has_names
 _QUESTIONS = {
     "ct": "CT: DICOM folder or file",
     "labels": "Segmentation: label map, .seg.nrrd, folder of masks or DICOM SEG (--segment finds the bones)",
-    "landmarks": "Landmarks of the CT (.mrk.json, .fcsv, .json)",
+    "landmarks": "Landmarks of the CT (.mrk.json, .fcsv, .csv, .json)",
     "plan": "Planned path: a line or points of 3D Slicer",
     "device": "CAD model of the device (empty: none)",
     "device_points": "Points tip and base of the device (.mrk.json, .fcsv, .json)",

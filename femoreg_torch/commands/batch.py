@@ -104,6 +104,7 @@ def _jobs(
     """
     import os
 
+    from femoreg_torch.case.reading import CASE_NAME
     from femoreg_torch.detect import load_network
     from femoreg_torch.errors import InputError, shortened
     from femoreg_torch.files import check_folder
@@ -111,6 +112,8 @@ def _jobs(
 
     if count < 1:
         raise InputError(f"--jobs: at least 1 was expected, got {count}.")
+    # a case.yaml stands for its folder; what is none is told in its row
+    cases = [case.parent if case.name == CASE_NAME and case.is_file() else case for case in cases]
     check_folder(out, cases)
     load_plan(preset)  # complains once, not for every case
     if weights is not None:

@@ -25,11 +25,12 @@ def beads(case: Path, *, beads: Path, out: Path, run: Path | None = None) -> Non
     from rich.markup import escape
 
     from femoreg_torch.beads import measure, read_beads, uncertainty_content, write_measured
-    from femoreg_torch.case import read_case, read_result
+    from femoreg_torch.case import case_folder, read_case, read_result
     from femoreg_torch.evaluation.fit import check_fits
     from femoreg_torch.files import check_new_folder
 
     console = Console()
+    case = case_folder(case)
     check_new_folder(out, case)
     procedure = read_case(case)
     rough = None

@@ -11,9 +11,9 @@ def inspect(path: Path, *, out: Path = Path("inspect.png"), series: str | None =
     """Say what a file or folder holds, and what may be wrong with it, and show it in a picture.
 
     Knows: CTs and label maps (DICOM folder, NIfTI, NRRD, MHA), segmentations of 3D Slicer (.seg.nrrd), folders with a
-    mask for each bone (TotalSegmentator), DICOM SEG; landmarks and other points (.mrk.json, .fcsv, .json), meshes,
-    transforms (.tfm, .h5), images, and case folders. Of a folder with several of these it says in one line each what
-    they are. A volume is shown in three planes.
+    mask for each bone (TotalSegmentator), DICOM SEG; landmarks and other points (.mrk.json, .fcsv, .csv, .json),
+    meshes, transforms (.tfm, .h5), images, and case folders. Of a folder with several of these it says in one line each
+    what they are. A volume is shown in three planes.
 
     Args:
         path: File or folder.
@@ -53,10 +53,12 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     from rich.console import Console
     from rich.markup import escape
 
+    from femoreg_torch.case import case_folder
     from femoreg_torch.case.start_files import read_pixels
     from femoreg_torch.commands.status import AMISS, DONE
     from femoreg_torch.intake import check_case
 
+    case = case_folder(case)
     _check_picture(out, case)
     console = Console(soft_wrap=True)
     pixels = None if landmarks is None else read_pixels(landmarks)

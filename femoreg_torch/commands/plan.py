@@ -29,7 +29,7 @@ def plan(
     """
     from rich.console import Console
 
-    from femoreg_torch.case import read_case
+    from femoreg_torch.case import case_folder, read_case
     from femoreg_torch.commands.telling import progress_report, tell_device
     from femoreg_torch.files import check_new_folder, new_folder
     from femoreg_torch.planning.figures import curves_figure, overlay_figure, save
@@ -39,6 +39,7 @@ def plan(
     from femoreg_torch.planning.settings import load_planning
 
     console = Console()
+    case = case_folder(case)
     check_new_folder(out, case)
     place = tell_device(console, device)
     content = read_case(case)

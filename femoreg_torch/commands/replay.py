@@ -37,12 +37,12 @@ def case_of(run: Path, result: "Result", case: Path | None) -> Path:
     """The case folder that was named, or else the one that the result of `run` names. Raises `InputError`."""
     from femoreg_torch.case import RESULT_NAME
     from femoreg_torch.errors import InputError
+    from femoreg_torch.paths import check_readable
 
     if case is not None:
         return case
     if result.case is None:
         raise InputError(f"{run / RESULT_NAME}, case: missing. Name the case folder with --case.")
     folder = run / result.case
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder. Name the case folder with --case.")
+    check_readable(folder, "Name the case folder with --case.", "folder")
     return folder

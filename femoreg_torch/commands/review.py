@@ -76,12 +76,13 @@ def review(
 
 def _case_and_run(folder: Path, case: Path | None, out: Path | None) -> tuple[Path, Path]:
     """The case, and the folder of its run. Raises `InputError` where either is not told."""
-    from femoreg_torch.case import RESULT_NAME, read_result
+    from femoreg_torch.case import RESULT_NAME, case_folder, read_result
     from femoreg_torch.commands.replay import case_of
     from femoreg_torch.errors import InputError
 
     if (folder / RESULT_NAME).exists():
         return case_of(folder, read_result(folder), case), out or folder
+    folder = case_folder(folder)
     if not (folder / "case.yaml").exists():
         raise InputError(
             f"{folder}: neither a run nor a case, it holds no {RESULT_NAME} and no case.yaml. Name the folder of one."

@@ -13,6 +13,7 @@ from femoreg_torch.configs import preset_names
 from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.extensions import find
+from femoreg_torch.paths import check_readable
 from femoreg_torch.settings import read_record
 
 NETWORKS_GROUP: Final = "femoreg_torch.networks"  # entry points of other packages' networks, see `models.protocols`
@@ -43,6 +44,8 @@ def load_network(path: Path | None = None, device: torch.device = CPU) -> Landma
     from models.weights import SHIPPED_WEIGHTS, read_weights
 
     where = str(path or SHIPPED_WEIGHTS)
+    if path is not None:
+        check_readable(path, "Give a weights file (safetensors) that `femoreg train` wrote.")
     try:
         weights = read_weights(path)
     except (OSError, ValueError) as error:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from femoreg_torch.arrays import check_pixels, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro.tags import Tags, find_value, read_tags, value_in
+from femoreg_torch.paths import check_readable
 from femoreg_torch.volume.dicom import damaged_header
 
 Frames = tuple[int, ...] | Literal["mean"]  # of a cine run: numbers from 1, averaged, or all of them
@@ -75,8 +76,7 @@ def _dataset(path: Path, **options: Any) -> Any:
     import pydicom  # a fifth of a second, and most images are of other kinds
     from pydicom.errors import InvalidDicomError
 
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file.")
+    check_readable(Path(path))
     try:
         return pydicom.dcmread(path, **options)
     except InvalidDicomError as error:

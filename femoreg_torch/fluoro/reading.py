@@ -22,6 +22,7 @@ from femoreg_torch.fluoro.dicom import SCREEN, DicomImage, Frames, read_dicom, r
 from femoreg_torch.fluoro.png import chunks_are_there
 from femoreg_torch.fluoro.tags import Tags
 from femoreg_torch.geometry import Camera
+from femoreg_torch.paths import check_readable
 from femoreg_torch.pictures import write_picture
 from femoreg_torch.text import read_bytes
 from femoreg_torch.volume.dicom import is_dicom
@@ -118,8 +119,7 @@ def read_stored(path: Path, frames: Frames | None = None) -> StoredImage:
     and an image of constant value.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
+    check_readable(path)
     name = path.name.lower()
     dicom: DicomImage | None = None
     remarks: tuple[str, ...] = ()

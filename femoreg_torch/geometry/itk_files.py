@@ -14,6 +14,7 @@ from torch import Tensor
 from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry.rigid import check_rigid, invert_rigid, rigid
+from femoreg_torch.paths import check_readable
 from femoreg_torch.text import read_bytes
 
 _MOST_BYTES = 2**18  # of a file with one transform
@@ -63,6 +64,7 @@ def _transform_text(path: Path) -> str:
     of_kind = _READERS.get(Path(path).suffix.lower())
     if of_kind is None:
         raise InputError(f"{path}: a name that ends in {', '.join(_READERS)} was expected.")
+    check_readable(Path(path))
     try:
         kind, parameters, fixed = of_kind(path)
         if not all(map(math.isfinite, (*parameters, *fixed))):

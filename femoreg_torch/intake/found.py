@@ -36,7 +36,7 @@ class Found:
         """Every key that is not known is a problem."""
         for key in fields.content:
             if key not in known:
-                self.attempt(lambda key=key: Fields({key: 0}, fields.file, fields.path).only(*known))  # type: ignore[misc]
+                self.attempt(lambda key=key: fields.inside({key: 0}).only(*known))  # type: ignore[misc]
 
 
 def alike_together(problems: Sequence[str]) -> list[str]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, bone_of_name, fitting_tables
 from femoreg_torch.case import read_case
+from femoreg_torch.case.reading import CASE_NAME
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Frames, nearest_side, read_stored
 from femoreg_torch.geometry import read_itk_transform
@@ -21,6 +22,7 @@ from femoreg_torch.intake.volumes import (
     header_warnings,
     looks_like_labels,
 )
+from femoreg_torch.paths import check_readable
 from femoreg_torch.volume import (
     Volume,
     has_names,
@@ -38,7 +40,7 @@ from femoreg_torch.volume.segments import SEGMENTATION_SUFFIX
 
 _VOLUMES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd", ".hdr")
 _MESHES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb", ".step", ".stp")
-_POINTS = (".fcsv", ".json")
+_POINTS = (".fcsv", ".json", ".csv", ".tsv")
 _TRANSFORMS = (".tfm", ".h5", ".mat")
 _PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _LISTED = 40  # entries of a folder
@@ -67,10 +69,11 @@ class Findings:
 def inspect_path(path: Path, series: str | None = None) -> Findings:
     """What a file or a folder is; `series` chooses among several DICOM series. Raises `InputError`."""
     path = Path(path)
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder.")
+    check_readable(path, expected="file or folder")
     if path.is_dir():
         return _folder(path, series)
+    if path.name == CASE_NAME:
+        return _case(path)
     name = path.name.lower()
     kinds: tuple[tuple[tuple[str, ...], Callable[[Path], Findings]], ...] = (
         ((SEGMENTATION_SUFFIX,), _segmentation),
@@ -124,7 +127,7 @@ def _entries(folder: Path) -> list[Path]:
 
 def _kind_of(folder: Path) -> str:
     """What a folder is, by the names in it."""
-    if (folder / "case.yaml").is_file():
+    if (folder / CASE_NAME).is_file():
         return "case"
     names = [entry.name.lower() for entry in _entries(folder)]
     if any(name.endswith(_ALONE) for name in names):

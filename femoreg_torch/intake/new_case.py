@@ -14,7 +14,7 @@ from femoreg_torch.anatomy import HIP, LabelTable, label_table, label_table_name
 from femoreg_torch.case.femoroplasty import DEVICE, DEVICE_POINTS, FEMUR, TEMPLATE, femoral_head, operated_femur
 from femoreg_torch.case.model import Intensity, Side
 from femoreg_torch.case.nominal import ALONG_PATH, NominalPlace
-from femoreg_torch.case.reading import VERSIONS
+from femoreg_torch.case.reading import CASE_NAME, VERSIONS
 from femoreg_torch.case.writing import display_content
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import new_folder, plain, write_text
@@ -22,6 +22,7 @@ from femoreg_torch.fluoro import Display, Source, carm_settings, may_be_image, n
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.check import check_case
 from femoreg_torch.intake.label_tables import table_of_map
+from femoreg_torch.paths import why_unreadable
 from femoreg_torch.segment import load_bone_network, propose_landmarks, segment_bones
 from femoreg_torch.volume import (
     Volume,
@@ -120,7 +121,8 @@ def _sources(content: dict[str, Any], given: NewCase) -> dict[str, Path]:
 
 
 def _as_given(problem: str, folder: Path, sources: dict[str, Path]) -> str:
-    """The problem with the files given in place of their copies in `folder`, which are not kept."""
+    """The problem with the files given in place of their copies in `folder`, which are not kept, nor is its form."""
+    problem = re.sub(rf"\b({CASE_NAME}), line \d+", r"\1", problem)
     copies = rf"({re.escape(str(folder))}/)?\b({'|'.join(map(re.escape, sources))})(?!\w)"
     return re.sub(copies, lambda found: str(sources[found[2]]) if found[1] else _short(sources[found[2]]), problem)
 
@@ -134,10 +136,11 @@ def _check_given(given: NewCase) -> None:
     ]
     paths = {name: getattr(given, name) for name in ("ct", "labels", "landmarks", "plan", "device", "device_points")}
     for name, path in {**paths, "device_transform": given.device_transform}.items():
-        if path is not None and not Path(path).exists():
-            told.append(f"--{name.replace('_', '-')}: there is no {path}")
+        if path is not None and (why := why_unreadable(Path(path), expected="file or folder")) is not None:
+            told.append(f"--{name.replace('_', '-')}: {path}: {why}")
     for flag, images in (("images", given.images), ("device-images", given.device_images)):
-        told += [f"--{flag}: there is no {path}" for path in images if not path.exists()]
+        wrong = ((path, why_unreadable(path, expected="file or folder")) for path in images)
+        told += [f"--{flag}: {path}: {why}" for path, why in wrong if why is not None]
     if given.device is not None and given.device_points is None:
         told.append("--device-points is missing: the device's tip and base")
     if given.device is None and (given.device_images or given.device_points):
@@ -357,8 +360,8 @@ def _carm(folder: Path, given: NewCase, image: Path, notes: list[str]) -> str | 
     """The preset's name, the copied YAML file's, or what the tags of a DICOM image say."""
     if given.carm is not None:
         if given.carm.endswith((".yaml", ".yml")):
-            if not Path(given.carm).is_file():
-                raise InputError(f"--carm: there is no file {given.carm}.")
+            if (why := why_unreadable(Path(given.carm))) is not None:
+                raise InputError(f"--carm: {given.carm}: {why}")
             return _copied(Path(given.carm), folder, "carm")
         return given.carm
     if not is_dicom(image):

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError, in_mm, shortened
 from femoreg_torch.geometry import check_rigid, read_itk_transform
+from femoreg_torch.paths import check_readable
 from femoreg_torch.text import MOST_YAML_BYTES, read_bytes
 
 _LEAST_REACH_MM = 10.0  # no tool or flange stands this close to the base of its robot: the numbers are metres
@@ -54,8 +55,7 @@ def read_robot(path: Path, tool: str) -> Robot:
     not finite, of another shape, missing or unknown, or in metres.
     """
     path, names = Path(path), _Names(tool)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file. The robot's calibration holds {names.format}.")
+    check_readable(path, f"The robot's calibration holds {names.format}.")
     found = {path.stem: read_itk_transform(path)} if path.suffix.lower() == ".tfm" else _read_text(path, names)
     if set(found) not in (names.direct, names.by_flange):
         there = ", ".join(f"`{name}`" for name in found) or "no matrix"

@@ -83,8 +83,6 @@ def camera_shape(file: Hdf5File, rows: str, columns: str, path: Path) -> tuple[i
 
 def read_transform(path: Path) -> Tensor:
     """The rigid matrix (4, 4) of an ITK transform file, `.h5` or `.tfm`, as it takes points. Raises `InputError`."""
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file.")
     return invert_rigid(read_itk_transform(path))
 
 

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from femoreg_torch.case import RESULT_NAME, Result, read_result
 from femoreg_torch.case.model import Side
+from femoreg_torch.delimited import read_csv
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.files import read_csv
 from femoreg_torch.planning.diffusion import diffuse
 from femoreg_torch.planning.path import Ellipsoid, Path, Surroundings
 from femoreg_torch.planning.prepare import Prepared
@@ -210,4 +210,4 @@ def _read_runs(folder: File) -> dict[str, Sequence[Any]]:
     if not text.is_file():
         raise InputError(f"{folder}: holds neither runs.parquet nor runs.csv. Give the folder of a study.")
     rows = read_csv(text, ())
-    return {name: [row[name] or "nan" for row in rows] for name in rows[0] if name is not None}
+    return {name: [row.values[name] or "nan" for row in rows] for name in rows[0].values}

@@ -16,6 +16,7 @@ from pandas.api.types import is_object_dtype, is_scalar
 
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import temporary_file
+from femoreg_torch.paths import check_readable
 from femoreg_torch.statistics.quantities import AXES, METRICS, OBJECTS, PELVIS_AT_HEAD, POSE_QUANTITIES, QUANTITIES
 
 ROWS_NAME, TRIALS_NAME = "runs.parquet", "trials.parquet"
@@ -49,8 +50,7 @@ def read_rows(path: Path) -> pd.DataFrame:
 
     Raises `InputError` where the file is missing, no Parquet, without rows, lacks a column, or holds what cannot be.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file. Give a folder with the runs of a study, {ROWS_NAME}.")
+    check_readable(path, f"Give a folder with the runs of a study, {ROWS_NAME}.")
     try:
         rows = pd.read_parquet(path)
     except (OSError, ValueError) as error:  # pyarrow's own errors are ValueErrors

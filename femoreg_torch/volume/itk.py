@@ -7,6 +7,7 @@ import SimpleITK as sitk
 
 from femoreg_torch.arrays import check_claim, quiet
 from femoreg_torch.errors import InputError
+from femoreg_torch.paths import check_readable
 from femoreg_torch.volume.nifti import NIFTI_SUFFIXES, check_nifti
 from femoreg_torch.volume.text_headers import META_SUFFIXES, NRRD_SUFFIXES, check_text_header
 
@@ -21,8 +22,7 @@ def read_itk(path: Path) -> sitk.Image:
     be worked with, lies nowhere (an origin of NaN), or holds complex values or, in a NIfTI file, values that are not
     finite.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
+    check_readable(path)
     check_nifti(path)
     check_text_header(path)
     try:

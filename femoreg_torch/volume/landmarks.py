@@ -1,7 +1,8 @@
 """Files of landmarks, in 3-D. Inside, landmarks are LPS mm, in the order of their anatomy."""
 
-import csv
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +10,29 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
+from femoreg_torch.delimited import Row, check_decimal_marks, decimal, read_csv, read_lines, rows_of, separator_of
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import read_json, write_json
 from femoreg_torch.geometry.rigid import FARTHEST_MM
-from femoreg_torch.text import MOST_JSON_BYTES, read_bytes
 from femoreg_torch.volume.grid import Volume
 
 _LPS_FROM = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
 _SPACES = {"0": "RAS", "1": "LPS", "RAS": "RAS", "LPS": "LPS"}  # numbers as in 3D Slicer before 4.11
 _LONGEST_NAME = 60  # characters of a point's name that a message repeats as they are
+_AXES = {"LPS": ("l", "p", "s"), "RAS": ("r", "a", "s")}  # columns of a table
+_TABLES = (".csv", ".tsv")
+_AROUND_REMARKS = '" ;,\t'  # what spreadsheets put around the lines with #
 _FCSV_COLUMNS = "id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID"
+
+
+@dataclass(frozen=True)
+class _Given:
+    """A point as a file gives it, nothing checked."""
+
+    space: Any
+    label: Any
+    position: Any
+    line: str = ""  # `line 3, ` where it is known
 
 
 def _signs(space: Any, where: str) -> tuple[float, float, float]:
@@ -37,7 +51,7 @@ def _check_unit(unit: Any, where: str) -> None:
         raise InputError(f"{where}: the unit must be mm, found {shortened(unit)}. Convert the points.")
 
 
-def _plain_points(content: dict[str, Any], path: Path) -> list[tuple[Any, Any, Any]]:
+def _plain_points(content: dict[str, Any], path: Path) -> list[_Given]:
     for key in ("space", "unit", "landmarks"):
         if key not in content:
             raise InputError(
@@ -47,11 +61,11 @@ def _plain_points(content: dict[str, Any], path: Path) -> list[tuple[Any, Any, A
     _check_unit(content["unit"], f"{path}, unit")
     if not isinstance(content["landmarks"], dict):
         raise InputError(f"{path}, landmarks: an object of names and points was expected.")
-    return [(content["space"], name, value) for name, value in content["landmarks"].items()]
+    return [_Given(content["space"], name, value) for name, value in content["landmarks"].items()]
 
 
-def _slicer_points(content: dict[str, Any], path: Path) -> list[tuple[Any, Any, Any]]:
-    """Space, name and position of every point that is placed, of all lists in the file."""
+def _slicer_points(content: dict[str, Any], path: Path) -> list[_Given]:
+    """Every point that is placed, of all lists in the file."""
     markups = content["markups"]
     if not isinstance(markups, list) or not markups or not all(isinstance(markup, dict) for markup in markups):
         raise InputError(f"{path}, markups: one list of points was expected.")
@@ -63,27 +77,57 @@ def _slicer_points(content: dict[str, Any], path: Path) -> list[tuple[Any, Any, 
             raise InputError(f"{path}, controlPoints: a list of points was expected.")
         placed = (point for point in points if point.get("positionStatus", "defined") == "defined")
         space = markup.get("coordinateSystem")
-        found += [(_SPACES.get(str(space), space), point.get("label"), point.get("position")) for point in placed]
+        found += [_Given(_SPACES.get(str(space), space), point.get("label"), point.get("position")) for point in placed]
     return found
 
 
-def _fcsv_points(path: Path) -> list[tuple[Any, Any, Any]]:
+def _fcsv_points(path: Path) -> list[_Given]:
     """Without a line that tells the space it is RAS: that of 3D Slicer before 4.11, and of xReg."""
-    try:
-        lines = read_bytes(path, MOST_JSON_BYTES).decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: cannot be read as an .fcsv file ({error}).") from error
-    comments = (line.lstrip("# ").split("=", 1) for line in lines if line.startswith("#") and "=" in line)
-    header = {key.strip(): value.strip() for key, value in comments}
-    space, columns = header.get("CoordinateSystem", "RAS"), header.get("columns", _FCSV_COLUMNS).split(",")
-    if missing := {"label", "x", "y", "z"} - set(columns):
+    lines = read_lines(path)
+    told = [line.strip(_AROUND_REMARKS) for line in lines if _is_remark(line)]
+    header = {key.strip("# "): value.strip() for key, _, value in (line.partition("=") for line in told)}
+    space = header.get("CoordinateSystem", "RAS")
+    columns = [name.strip() for name in re.split("[,;\t]", header.get("columns", _FCSV_COLUMNS))]
+    needed = ("label", "x", "y", "z")
+    if missing := set(needed) - set(columns):
         raise InputError(f"{path}: its columns lack {', '.join(sorted(missing))}. Save it anew with 3D Slicer.")
-    reader = csv.DictReader((line for line in lines if line.strip() and not line.startswith("#")), fieldnames=columns)
+    values = ["" if _is_remark(line) else line for line in lines]
+    separator = separator_of(values, max(columns.index(name) for name in needed) + 1)
+    rows = list(rows_of(values, columns, needed, separator, str(path)))
+    return _of_rows(rows, {_SPACES.get(space, space): ("x", "y", "z")}, "label", path)
+
+
+def _is_remark(line: str) -> bool:
+    return line.lstrip('" ').startswith("#")
+
+
+def _csv_points(path: Path) -> list[_Given]:
+    """The points of a table as 3D Slicer exports it, whose columns tell the space: l, p, s or r, a, s."""
+    rows = read_csv(path, ("label",))
+    axes = {space: letters for space, letters in _AXES.items() if set(letters) <= set(rows[0].values)}
+    if len(axes) != 1:
+        raise InputError(
+            f"{path}: columns `label` and `l`, `p`, `s` (or `r`, `a`, `s`) in mm were expected, found "
+            f"{shortened(', '.join(rows[0].values), 80)}. Other names do not say which way x, y and z run."
+        )
+    placed = [row for row in rows if row.values.get("defined", "1") not in ("0", "false")]
+    return _of_rows(placed, axes, "label", path)
+
+
+def _of_rows(rows: list[Row], axes: Mapping[str, tuple[str, ...]], label: str, path: Path) -> list[_Given]:
+    ((space, columns),) = axes.items()
+    check_decimal_marks(rows, columns, str(path))
+    return [
+        _Given(space, row.values[label], [_number(row.values[name]) for name in columns], f"line {row.line}, ")
+        for row in rows
+    ]
+
+
+def _number(text: str) -> float | str:
     try:
-        rows = list(reader)
-    except csv.Error as error:
-        raise InputError(f"{path}: cannot be read as an .fcsv file ({error}).") from error
-    return [(_SPACES.get(space, space), row["label"], [row["x"], row["y"], row["z"]]) for row in rows]
+        return decimal(text)
+    except ValueError:
+        return text
 
 
 def _point(value: Any, where: str) -> Tensor:
@@ -94,7 +138,10 @@ def _point(value: Any, where: str) -> Tensor:
     except (TypeError, ValueError, OverflowError):
         point = torch.empty(0)
     if point.shape != (3,) or not torch.isfinite(point).all() or point.abs().max() > FARTHEST_MM:
-        raise InputError(f"{where}: three finite numbers [x, y, z] in mm were expected, found {shortened(value)}.")
+        commas = " Are these decimal commas? Write points." if isinstance(value, list) and len(value) == 6 else ""
+        raise InputError(
+            f"{where}: three finite numbers [x, y, z] in mm were expected, found {shortened(value)}.{commas}"
+        )
     return point
 
 
@@ -103,8 +150,9 @@ def read_landmarks(path: Path, known: Sequence[str] | None = HIP.landmark_names)
 
     Without known names any will do, in the order of the file. Known names may be written in capitals or small letters,
     with `_`, a space or nothing in place of `-`. Formats: `{"space": "LPS", "unit": "mm", "landmarks": {name: [x, y,
-    z]}}`, 3D Slicer markups (`.mrk.json`) and `.fcsv` (also of xReg), each in LPS or RAS as its header says. Raises
-    `InputError` for an unknown or repeated name, another unit or space, or a point that is not three finite numbers.
+    z]}}`, 3D Slicer markups (`.mrk.json`), `.fcsv` (also of xReg) and tables of Slicer (`.csv`, `.tsv`), each in LPS or
+    RAS as its header says. Values of tables may stand between semicolons, with decimal commas. Raises `InputError` for
+    an unknown or repeated name, another unit or space, or a point that is not three finite numbers.
     """
     path = Path(path)
     told = "" if known is None else f" Known names: {', '.join(known)}."
@@ -133,19 +181,19 @@ def _plain_name(text: str) -> str:
 
 def _points(path: Path) -> list[tuple[str, Tensor]]:
     """Name and position (3,), LPS mm, of every point in a file, in its order. Raises `InputError`."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
     if path.suffix.lower() == ".fcsv":
         points = _fcsv_points(path)
+    elif path.suffix.lower() in _TABLES:
+        points = _csv_points(path)
     else:
         content = read_json(path, with_nan=True)  # of a point that was not placed, or a measurement without a value
         points = (_slicer_points if "markups" in content else _plain_points)(content, path)
     found = []
-    for number, (space, label, value) in enumerate(points, 1):
-        name = label if isinstance(label, str) else ""
-        signs = torch.tensor(_signs(space, f"{path}, coordinate system"), dtype=torch.float64)
+    for number, point in enumerate(points, 1):
+        name = point.label.strip() if isinstance(point.label, str) else ""
+        signs = torch.tensor(_signs(point.space, f"{path}, coordinate system"), dtype=torch.float64)
         told = _told(name) if name else f"point {number} (no name)"
-        found.append((name, _point(value, f"{path}, {told}") * signs))
+        found.append((name, _point(point.position, f"{path}, {point.line}{told}") * signs))
     return found
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from femoreg_torch.arrays import opened, quiet
 from femoreg_torch.errors import InputError, in_mm
+from femoreg_torch.paths import check_readable
 from femoreg_torch.volume.mesh import check_closed
 
 if TYPE_CHECKING:
@@ -82,8 +83,7 @@ def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, tri
     """The surfaces of a file by name, where they stand in the file's scene, in mm. OBJ files can be split."""
     import trimesh  # takes most of a second, which reading of the CT hides
 
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
+    check_readable(path)
     if path.suffix.lower() in (".step", ".stp"):
         raise InputError(f"{path}: is a STEP file. Export it as STL, or as 3MF if it has several bodies.")
     if path.suffix.lower() not in _SUFFIXES:

@@ -14,6 +14,7 @@ from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError, in_mm
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry.rigid import FARTHEST_MM
+from femoreg_torch.paths import check_readable
 from femoreg_torch.volume.dicom import choose_series, is_dicom, read_series
 from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.itk import read_itk
@@ -26,8 +27,7 @@ _FAT_HU, _BONE_HU = -50, 200  # every CT of a hip holds something below the firs
 
 def _read(path: Path, series: str | None = None) -> tuple[sitk.Image, tuple[str, ...]]:
     """The stored volume, and what had to be done to it in words. Raises `InputError`."""
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder.")
+    check_readable(path, expected="file or folder")
     if not (path.is_dir() or is_dicom(path)):
         return read_itk(path), ()
     try:

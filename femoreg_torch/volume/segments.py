@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.paths import check_readable
 from femoreg_torch.volume.dicom import image_of, is_dicom, series_in
 from femoreg_torch.volume.itk import read_itk
 from femoreg_torch.volume.text_headers import NRRD_SUFFIXES, check_text_header
@@ -83,8 +84,7 @@ def read_segments(path: Path, labels: Collection[int] | None = None) -> tuple[si
 
 
 def _segments(path: Path) -> list[Segment]:
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder.")
+    check_readable(path, expected="file or folder")
     if path.is_dir() and (masks := _masks(path)):
         names = (re.sub(r"\.(seg\.nrrd|nii\.gz|nii|nrrd|mha|mhd)$", "", mask.name, flags=re.I) for mask in masks)
         return [Segment(name, n, path=mask) for n, (name, mask) in enumerate(zip(names, masks, strict=True), 1)]

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
+from femoreg_torch.case import case_folder
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import Camera, carm_from_dict, load_carm
@@ -119,6 +120,7 @@ def write_labelled_images(folder: Path, out: Path, config: str, count: int, seed
     settings = load_labelled_settings(config)
     if count < 1:
         raise InputError(f"labelled images: a count of 1 or more was expected, got {count}.")
+    folder = case_folder(folder)
     patient = read_imaged_patient(folder)
     write_labelled(out, render_views(patient, settings, count, seed, source or folder.resolve().name))
 

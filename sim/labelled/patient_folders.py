@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, LabelTable, label_table
-from femoreg_torch.case import read_case
+from femoreg_torch.case import case_folder, read_case
 from femoreg_torch.case.reading import read_fields
 from femoreg_torch.errors import InputError
+from femoreg_torch.paths import check_readable
 from femoreg_torch.volume import (
     BoneLabels,
     Volume,
@@ -66,9 +67,8 @@ class ScannedPatient:
 
 
 def find_patient(folder: Path) -> PatientFiles:
-    """The files of the patient in `folder`. Raises `InputError` if one is missing, or a landmark."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder. One with a CT, its label map and landmarks was expected.")
+    """The files of the patient in a folder, or of its `case.yaml`. Raises `InputError` if something is missing."""
+    folder = case_folder(folder)
     in_case = (folder / _CASE).exists()
     files = _files_of_case(folder) if in_case else _files_by_name(folder)
     if missing := [name for name in HIP.landmark_names if name not in files.landmarks]:
@@ -82,11 +82,10 @@ def find_patient(folder: Path) -> PatientFiles:
 def _files_by_name(folder: Path) -> PatientFiles:
     ct, labels, landmarks = (folder / name for name in ("ct.nii.gz", "labels.nii.gz", "landmarks.json"))
     for path in (ct, labels, landmarks):
-        if not path.is_file():
-            raise InputError(
-                f"{path}: no such file. A case folder (with {_CASE}) was expected, or one with ct.nii.gz, "
-                "labels.nii.gz and landmarks.json."
-            )
+        check_readable(
+            path,
+            f"A case folder (with {_CASE}) was expected, or one with ct.nii.gz, labels.nii.gz and landmarks.json.",
+        )
     return PatientFiles(folder, ct, labels, landmarks, read_landmarks(landmarks), label_table(_TABLE), in_case=False)
 
 

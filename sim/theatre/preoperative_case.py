@@ -23,6 +23,7 @@ from femoreg_torch.case.model import Model, PlannedPath, Side, Start
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry import load_carm
+from femoreg_torch.paths import check_readable
 from femoreg_torch.volume import check_inside, read_ct, read_labels, read_landmarks, read_mesh
 from sim.theatre.device import make_device
 from sim.theatre.nominal_poses import nominal_ap, nominal_device
@@ -91,8 +92,7 @@ def read_preoperative(folder: Path, side: Side, seed: int, settings: Simulation,
 def _bare(folder: Path) -> Case:
     """The case of a folder that holds a patient alone."""
     for name in _FILES:
-        if not (folder / name).is_file():
-            raise InputError(f"{folder}: holds neither case.yaml nor {name}. Make a patient with `femoreg phantom`.")
+        check_readable(folder / name, f"{folder} holds no case.yaml either. Make a patient with `femoreg phantom`.")
     ct, labels, landmarks = (folder / name for name in _FILES)
     return Case(
         folder=folder,

@@ -26,7 +26,7 @@ def pose(seed: int) -> torch.Tensor:
 def example(folder: Path) -> Case:
     """A case with two views and everything that is optional; its files are there but empty."""
     for name in FILES:
-        (folder / name).touch()
+        (folder / name).write_bytes(b"some")
     points = torch.randn(18, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 100
     landmarks = dict(zip(HIP.landmark_names, points, strict=False))
     device_points = dict(zip(("tip", "base", "center"), points[15:], strict=True))
@@ -111,7 +111,7 @@ def test_the_poses_of_a_biplane_come_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("hu", "labels"), [(5000.0, (3, 7)), (None, None)])
 def test_a_device_as_a_volume_comes_back(tmp_path: Path, hu: float | None, labels: tuple[int, ...] | None) -> None:
     case = example(tmp_path)
-    (tmp_path / "device.nrrd").touch()
+    (tmp_path / "device.nrrd").write_bytes(b"some")
     device = device_of(case)
     assert device is not None
     device = replace(device, model=Model(tmp_path / "device.nrrd", hu, labels))
@@ -158,20 +158,20 @@ def as_volume(content: dict[str, Any], file: str, **change: Any) -> None:
 
 
 BAD: list[tuple[Change, str]] = [
-    (lambda c: c.update(sied="left"), r"case\.yaml, sied: unknown key"),
-    (lambda c: c.pop("side"), r"case\.yaml, side: is missing, left or right"),
-    (lambda c: c.update(side="both"), r"case\.yaml, side: left or right was expected, found 'both'"),
-    (lambda c: c.update(version=3), r"case\.yaml, version: .* found 3"),
-    (lambda c: c.update(version=True), r"case\.yaml, version: .* found True"),
-    (lambda c: c.update(template="knee"), r"case\.yaml, template: femoroplasty was expected, found 'knee'"),
-    (lambda c: c.pop("template"), r"case\.yaml, side: unknown key"),
-    (lambda c: c.pop("version"), r"case\.yaml, version: is missing"),
-    (lambda c: c.pop("ct"), r"case\.yaml, ct: is missing"),
-    (lambda c: c.update(ct="ct.nii.gz"), r"case\.yaml, ct: a mapping"),
+    (lambda c: c.update(sied="left"), r"case\.yaml, .*sied: unknown key"),
+    (lambda c: c.pop("side"), r"case\.yaml, .*side: is missing, left or right"),
+    (lambda c: c.update(side="both"), r"case\.yaml, .*side: left or right was expected, found 'both'"),
+    (lambda c: c.update(version=3), r"case\.yaml, .*version: .* found 3"),
+    (lambda c: c.update(version=True), r"case\.yaml, .*version: .* found True"),
+    (lambda c: c.update(template="knee"), r"case\.yaml, .*template: femoroplasty was expected, found 'knee'"),
+    (lambda c: c.pop("template"), r"case\.yaml, .*side: unknown key"),
+    (lambda c: c.pop("version"), r"case\.yaml, .*version: is missing"),
+    (lambda c: c.pop("ct"), r"case\.yaml, .*ct: is missing"),
+    (lambda c: c.update(ct="ct.nii.gz"), r"case\.yaml, .*ct: a mapping"),
     (lambda c: c["ct"].pop("image"), r"ct\.image: is missing"),
-    (lambda c: c["ct"].update(image="no.nii.gz"), r"ct\.image: there is no file .*no\.nii\.gz"),
+    (lambda c: c["ct"].update(image="no.nii.gz"), r"ct\.image: 'no\.nii\.gz': no such file"),
     (lambda c: c["ct"].update(image=3), r"ct\.image: the path of a file was expected, found 3"),
-    (lambda c: c["ct"].update(labels="no.nii.gz"), r"ct\.labels: there is no file"),
+    (lambda c: c["ct"].update(labels="no.nii.gz"), r"ct\.labels: .*no such file"),
     (lambda c: c["ct"].update(label="a"), r"ct\.label: unknown key"),
     (lambda c: c["ct"].pop("bones"), r"ct\.bones: missing. Name the table"),
     (lambda c: c["ct"].update(bones="totalsegmentor"), r"ct\.bones: no anatomy/labels preset .*totalsegmentator_v2"),
@@ -180,7 +180,7 @@ BAD: list[tuple[Change, str]] = [
     (lambda c: c["ct"].update(bones={"pelvis": 7}), r"ct\.bones: has no id of the femur_left"),
     (lambda c: c["ct"].update(bones={"pelvis": 0}), r"ct\.bones\.pelvis: a label id above 0"),
     (lambda c: c["ct"].update(bones={"pelvis": 1, "femur_left": [2, 1]}), r"femur_left: label 1 belongs to pelvis"),
-    (lambda c: c.update(landmarks="no.json"), r"case\.yaml, landmarks: there is no file"),
+    (lambda c: c.update(landmarks="no.json"), r"case\.yaml, .*landmarks: .*no such file"),
     (lambda c: c["plan"].pop("entry_point"), r"plan\.entry_point: is missing, a point"),
     (lambda c: c["plan"].update(entry_point=[1, 2]), r"plan\.entry_point: a point \[x, y, z\] in mm"),
     (lambda c: c["plan"].update(entry_point=[1, 2, float("nan")]), r"line .*: \.nan is no number"),
@@ -193,13 +193,13 @@ BAD: list[tuple[Change, str]] = [
     (lambda c: c["device"].pop("hu"), r"device\.hu: is missing"),
     (lambda c: c["device"].update(hu="steel"), r"device\.hu: a number was expected, found 'steel'"),
     (lambda c: c["device"].update(hu=True), r"device\.hu: a number was expected"),
-    (lambda c: c["device"].update(model="no.stl"), r"device\.model: there is no file"),
+    (lambda c: c["device"].update(model="no.stl"), r"device\.model: .*no such file"),
     (lambda c: c["device"].pop("model"), r"device\.model: is missing"),
     (lambda c: c["device"].update(model="labels.nii.gz"), r"device\.model: a mesh .*labels\.nii\.gz.*`volume`"),
     (lambda c: c["device"].update(volume="labels.nii.gz"), r"device\.volume: `model` \(a mesh\) is given too"),
     (lambda c: c["device"].update(labels=[1]), r"device\.labels: only a `volume` has labels"),
     (lambda c: as_volume(c, "device.stl", labels=[1]), r"device\.volume: a volume .*device\.stl.*`model`"),
-    (lambda c: as_volume(c, "no.nrrd", labels=[1]), r"device\.volume: there is no file"),
+    (lambda c: as_volume(c, "no.nrrd", labels=[1]), r"device\.volume: .*no such file"),
     (lambda c: as_volume(c, "labels.nii.gz", labels=[0]), r"device\.labels: a label id above 0.*found \[0\]"),
     (lambda c: as_volume(c, "labels.nii.gz", labels="all"), r"device\.labels: a label id above 0.*found 'all'"),
     (lambda c: as_volume(c, "labels.nii.gz", labels=[1], hu=None), r"device\.hu: is missing"),
@@ -211,20 +211,20 @@ BAD: list[tuple[Change, str]] = [
     (lambda c: c["device"].update(camera1_from_device=MIRRORED), r"device\.camera1_from_device: a mirrored"),
     (lambda c: c["device"].update(camera1_from_device=SCALED[:3]), r"device\.camera1_from_device: a 4×4 matrix"),
     (lambda c: c["device"].update(camera1_from_device=[[1, 2], [3]]), r"device\.camera1_from_device: a 4×4 matrix"),
-    (lambda c: c.update(carm="cios"), r"case\.yaml, carm: no carm preset 'cios'; there are: .*cios_fusion"),
-    (lambda c: c.update(carm=3), r"case\.yaml, carm: "),
-    (lambda c: c.update(carm={"sdd_mm": 1020}), r"case\.yaml, carm: `pixel_mm` is missing"),
-    (lambda c: c.update(carm={"sdd_mm": "far", "pixel_mm": [1, 1], "shape": [9, 9]}), r"case\.yaml, carm\.sdd_mm: "),
-    (lambda c: c.update(views="view1.tif"), r"case\.yaml, views: a list"),
-    (lambda c: c["views"][1].update(anatomy="no.tif"), r"case\.yaml, views\[1\]\.anatomy: there is no file"),
-    (lambda c: c["views"][0].update(device="no.tif"), r"case\.yaml, views\[0\]\.device: there is no file"),
-    (lambda c: c["views"][0].update(intensity="bright"), r"case\.yaml, views\[0\]\.intensity: raw or log"),
-    (lambda c: c["views"][0].update(image="view1.tif"), r"case\.yaml, views\[0\]\.image: unknown key"),
+    (lambda c: c.update(carm="cios"), r"case\.yaml, .*carm: no carm preset 'cios'; there are: .*cios_fusion"),
+    (lambda c: c.update(carm=3), r"case\.yaml, .*carm: "),
+    (lambda c: c.update(carm={"sdd_mm": 1020}), r"case\.yaml, .*carm: `pixel_mm` is missing"),
+    (lambda c: c.update(carm={"sdd_mm": "far", "pixel_mm": [1, 1], "shape": [9, 9]}), r"case\.yaml, .*carm\.sdd_mm: "),
+    (lambda c: c.update(views="view1.tif"), r"case\.yaml, .*views: a list"),
+    (lambda c: c["views"][1].update(anatomy="no.tif"), r"case\.yaml, .*views\[1\]\.anatomy: .*no such file"),
+    (lambda c: c["views"][0].update(device="no.tif"), r"case\.yaml, .*views\[0\]\.device: .*no such file"),
+    (lambda c: c["views"][0].update(intensity="bright"), r"case\.yaml, .*views\[0\]\.intensity: raw or log"),
+    (lambda c: c["views"][0].update(image="view1.tif"), r"case\.yaml, .*views\[0\]\.image: unknown key"),
     (lambda c: c["views"][0].update(camera_from_camera1=SCALED), r"views\[0\]\.camera_from_camera1: not a rigid"),
     (lambda c: c["views"][0].update(camera_from_camera1=SHIFTED), r"camera_from_camera1: the first view is camera 1"),
     (lambda c: c["views"][0].update(camera_from_camera1=EYE), r"views\[1\]\.camera_from_camera1: missing, while"),
     (lambda c: c["views"].pop(), r"truth\.json, camera_from_pelvis: 2 poses, but the case has 1 views"),
-    (lambda c: c.update(truth="no.json"), r"case\.yaml, truth: there is no file"),
+    (lambda c: c.update(truth="no.json"), r"case\.yaml, .*truth: .*no such file"),
 ]  # fmt: skip
 
 
@@ -252,7 +252,7 @@ def test_bad_fields(tmp_path: Path, n: int) -> None:
         ("truth.json", "camera_from_pelvis", [SCALED], r"truth\.json, camera_from_pelvis\[0\]: not a rigid"),
         ("truth.json", "camera_from_pelvis", [], r"truth\.json, camera_from_pelvis: a list"),
         ("truth.json", "seed", 1, r"truth\.json, seed: unknown key"),
-        ("landmarks.json", "landmarks", {"FH-r": [0, 0, 0]}, r"case\.yaml, landmarks: FH-l, .* is missing"),
+        ("landmarks.json", "landmarks", {"FH-r": [0, 0, 0]}, r"case\.yaml, .*landmarks: FH-l, .* is missing"),
     ],
 )
 def test_bad_truth_and_landmarks(tmp_path: Path, name: str, key: str, value: Any, message: str) -> None:

@@ -103,7 +103,7 @@ def test_a_transform_of_slicer_puts_the_device_where_slicer_shows_it(tmp_path: P
         ({"start": {"guide": "upwards"}}, r"device\.start: guide: one of along the planned path, from the side"),
         ({"start": {"before": 3}}, "unknown key 'before'"),
         ({"start": {"turned_deg": "much"}}, r"device\.start: .*turned_deg"),
-        ({"femur_from_device": "none.tfm"}, "there is no file"),
+        ({"femur_from_device": "none.tfm"}, "no such file"),
         ({"femur_from_device": [[1, 0]]}, "a 4×4 matrix of numbers was expected"),
         ({"femur_from_device": "scaled.tfm"}, "not a rigid transform"),
         ({"femur_from_device": "text.tfm"}, "cannot be read as an ITK transform"),

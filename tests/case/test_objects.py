@@ -47,7 +47,7 @@ CASE: dict[str, Any] = {
 
 def write(folder: Path, content: dict[str, Any]) -> Path:
     for name in ("ct.nii.gz", "labels.nii.gz", "wire.stl", "clamp.nrrd", "a.tif", "a_wire.tif", "b.tif", "b_wire.tif"):
-        (folder / name).touch()
+        (folder / name).write_bytes(b"some")
     points = {"space": "RAS", "unit": "mm", "landmarks": {"knee": [1, 2, 50], "ankle": [0, 0, -300]}}
     (folder / "landmarks.json").write_text(json.dumps(points), encoding="utf-8")
     (folder / "case.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
@@ -92,7 +92,7 @@ def test_one_kind_of_images_needs_no_name(tmp_path: Path) -> None:
 
 
 BAD: list[tuple[Callable[[dict[str, Any]], object], str]] = [
-    (lambda c: c.update(side="left"), r"case\.yaml, side: unknown key"),
+    (lambda c: c.update(side="left"), r"case\.yaml, .*side: unknown key"),
     (lambda c: c.update(objects={}), r"objects: is empty"),
     (lambda c: c["objects"]["shank"].update(bones="femur"), r"objects\.shank\.bones: `ct\.bones` has no 'femur'"),
     (

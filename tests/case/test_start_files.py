@@ -29,7 +29,7 @@ def test_markups_of_the_image_plane(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("", "a header with landmark, column_px, row_px"),
+        ("", r"is empty \(0 bytes\)"),
         ("landmark,x,y\nFH-l,1,2\n", "a header with landmark, column_px, row_px"),
         (HEADER + ROWS + "view2.tif,FH-l,1,2,1,1\n", "landmarks of 2 images"),
         (HEADER + ROWS + "view1.tif,FH-l,1,2,1,1\n", "line 5: the name of a landmark was expected, each once"),

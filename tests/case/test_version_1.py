@@ -36,7 +36,7 @@ CASE: dict[str, Any] = {
 
 def write(folder: Path, content: dict[str, Any]) -> Path:
     for name in ("ct.nii.gz", "labels.nii.gz", "device.stl", "view1.tif", "view1_device.tif"):
-        (folder / name).touch()
+        (folder / name).write_bytes(b"some")
     points = {"space": "LPS", "unit": "mm", "landmarks": {"FH-l": [90, 0, 0], "FH-r": [-90, 0, 0]}}
     (folder / "landmarks.json").write_text(json.dumps(points), encoding="utf-8")
     truth = {"camera_from_pelvis": [EYE], "camera1_from_femur": EYE, "camera1_from_device": EYE}

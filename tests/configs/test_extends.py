@@ -55,7 +55,7 @@ def test_a_file_extends_a_preset_or_a_file_beside_it(tmp_path: Path) -> None:
         ("extends: none", r"no carm preset 'none'; there are: .*cios_fusion"),
         ("extends: [a]", r"mine\.yaml, extends: the name of a preset"),
         ("- a", r"mine\.yaml: a mapping .* found list"),
-        ("a: [", r"mine\.yaml: cannot be read as YAML"),
+        ("a: [", r"mine\.yaml, line 1: cannot be read as YAML"),
         ("a: !!bool abc", r"mine\.yaml, line 1: tag .*bool"),
     ],
 )

@@ -137,7 +137,7 @@ def damaged(kind: str, folder: Path) -> Path:
     [
         ("missing", "no such file"),
         ("text", "cannot be read as a PNG, TIFF or JPEG"),
-        ("empty", "cannot be read as a PNG, TIFF or JPEG"),
+        ("empty", r"is empty \(0 bytes\)"),
         ("cut", "cannot be read as a PNG, TIFF or JPEG"),
         ("colour", "colour image"),
         ("constant", "every pixel is 77"),

@@ -89,7 +89,7 @@ def _text(path: Path, content: Any) -> Any:
 
 def _case(folder: Path) -> Iterator[Door]:
     for name in ("ct.nii.gz", "labels.nii.gz", "device.stl", "a.tif", "a_device.tif", "b.tif", "wire.stl"):
-        (folder / name).touch()
+        (folder / name).write_bytes(b"some")
     points = {name: [float(n), 10.0 * n, -5.0] for n, name in enumerate(HIP.landmark_names)}
     _text(folder / "landmarks.json", {"space": "LPS", "unit": "mm", "landmarks": points})
     truth = _text(

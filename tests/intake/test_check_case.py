@@ -120,10 +120,10 @@ def truth_of_two_views(c: Content, folder: Path) -> None:
 
 
 FAULTS: dict[str, Fault] = {
-    "side": (lambda c, f: c.update(side="links"), r"case\.yaml, side: left or right was expected, found 'links'"),
-    "extra key": (lambda c, f: c.update(sides="left"), r"case\.yaml, sides: unknown key"),
+    "side": (lambda c, f: c.update(side="links"), r"case\.yaml, .*side: left or right was expected, found 'links'"),
+    "extra key": (lambda c, f: c.update(sides="left"), r"case\.yaml, .*sides: unknown key"),
     "extra ct key": (lambda c, f: c["ct"].update(lables="x"), r"ct\.lables: unknown key"),
-    "no ct": (lambda c, f: c["ct"].update(image="none.nii.gz"), r"ct\.image: there is no file .*none\.nii\.gz"),
+    "no ct": (lambda c, f: c["ct"].update(image="none.nii.gz"), r"ct\.image: 'none\.nii\.gz': no such file"),
     "no labels": (lambda c, f: c["ct"].pop("labels"), r"ct\.labels: is missing, a label map"),
     "table": (lambda c, f: c["ct"].update(bones="totalseg"), r"ct\.bones: .*totalseg"),
     "no femur": (lambda c, f: relabelled(c, f, 5, 0), r"label map: no voxel carries the label 5, the femur_left"),
@@ -168,7 +168,7 @@ FAULTS: dict[str, Fault] = {
     ),
     "no model": (
         lambda c, f: c["device"].update(model="device.step"),
-        r"device\.model: there is no file .*device\.step",
+        r"device\.model: 'device\.step': no such file",
     ),
     "open mesh": (open_mesh, r"device\.stl: .*not closed|device\.stl: .*hole|device\.stl: .*closed"),
     "two materials": (lambda c, f: c["device"].update(material="steel"), r"device\.material: `hu` is given too"),
@@ -176,8 +176,8 @@ FAULTS: dict[str, Fault] = {
     "tip word": (lambda c, f: c["device"]["points"].update(tip="x"), r"device\.points\.tip: a point"),
     "guide": (lambda c, f: c["device"].update(start={"guide": "upwards"}), r"device\.start: guide: one of along"),
     "no start": (lambda c, f: c["device"].pop("start"), r"device\.camera1_from_device: is missing, the nominal"),
-    "carm": (lambda c, f: c.update(carm="siemens"), r"case\.yaml, carm: .*siemens"),
-    "view missing": (lambda c, f: (f / "view2.png").unlink(), r"views\[1\]\.anatomy: there is no file"),
+    "carm": (lambda c, f: c.update(carm="siemens"), r"case\.yaml, .*carm: .*siemens"),
+    "view missing": (lambda c, f: (f / "view2.png").unlink(), r"views\[1\]\.anatomy: .*no such file"),
     "view shape": (
         lambda c, f: cv2.imwrite(str(f / "view3.png"), np.arange(400, dtype=np.uint16).reshape(20, 20) * 9),
         r"views\[2\]\.anatomy: it is 20 × 20 pixels, but the C-arm has 48 × 40",

@@ -205,7 +205,10 @@ def test_images_whose_values_stand_beside_their_headers_are_copied_whole(files: 
             {"ct": None, "plan": None, "device_points": None},
             ["--ct is missing", "--plan is missing", "--device-points is"],
         ),
-        ({"labels": "none.nii.gz", "material": "steel", "hu": 3}, ["--labels: there is no", "--material and --hu"]),
+        (
+            {"labels": "none.nii.gz", "material": "steel", "hu": 3},
+            ["none.nii.gz: no such file or folder", "--material and --hu"],
+        ),
         ({"labels": "labels.nii.gz"}, ["--bones: is missing", "hip bones and femora of femoreg"]),
         ({"images": ["plain/run1"]}, ["3 files, but there are 1 images without the device"]),
         ({"images": ["view1.png", "view2.png", "view3.png"]}, ["--carm: is missing, and view1.png is no DICOM file"]),

@@ -308,7 +308,7 @@ def write_scaled_tfm(path: Path) -> None:
 
 BAD: list[tuple[str, Callable[[Path], object], str]] = [
     ("missing.txt", lambda path: None, "no such file"),
-    ("folder.txt", lambda path: path.mkdir(), "no such file"),
+    ("folder.txt", lambda path: path.mkdir(), "is a folder, a file was expected"),
     ("empty.txt", lambda path: path.write_text("# nothing\n", encoding="utf-8"), "holds no matrix"),
     ("picture.txt", lambda path: path.write_bytes(b"\x89PNG\xff\xfe\x00"), "is not text"),
     ("robot.txt", lambda path: path.write_text(rows(pose(5)), encoding="utf-8"), "holds `robot`. Expected"),

@@ -53,7 +53,7 @@ def test_a_tip_ten_metres_from_its_mesh(tip: tuple[float, float, float], good: b
 
 @pytest.mark.parametrize("hu", [-5000, -1000, 1e9, True, "dense"])
 def test_hu_that_no_solid_has(hu: object, tmp_path: Path) -> None:
-    (tmp_path / "a.stl").touch()
+    (tmp_path / "a.stl").write_bytes(b"some")
     with pytest.raises(InputError, match=r"case\.yaml, hu: "):
         read_model(Fields({"model": "a.stl", "hu": hu}, "case.yaml"), tmp_path)
     assert read_model(Fields({"model": "a.stl", "hu": 5000}, "case.yaml"), tmp_path) == Model(tmp_path / "a.stl", 5000)

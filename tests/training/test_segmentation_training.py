@@ -131,7 +131,7 @@ def test_a_shape_that_is_not_there_is_told_before_a_folder_is_made(
 ) -> None:
     missing, out = tmp_path / "none.npz", tmp_path / "run"
     assert main(["train-segmentation", "bones6", "--shapes", f"[{missing}]", "--out", str(out)]) == 2
-    assert f"--shapes: there is no file {missing}" in capsys.readouterr().err
+    assert f"--shapes: {missing}: no such file" in capsys.readouterr().err
     assert not out.exists()
 
 

@@ -175,9 +175,9 @@ def test_bad_fcsv(tmp_path: Path, change: tuple[str, str], message: str) -> None
         read_landmarks(tmp_path / "points.fcsv")
 
 
-def test_an_fcsv_that_is_another_table_names_the_point(tmp_path: Path) -> None:
+def test_an_fcsv_that_is_another_table_names_the_line(tmp_path: Path) -> None:
     (tmp_path / "points.fcsv").write_text("# Markups fiducial file version = 4.11\n1,2,3\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"point 1 \(no name\): three finite numbers"):
+    with pytest.raises(InputError, match=r"line 2: 3 values were found, but there are 14 columns"):
         read_landmarks(tmp_path / "points.fcsv")
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from femoreg_torch.anatomy import HIP, label_table
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import clear_leftovers, temporary_file
+from femoreg_torch.paths import why_unreadable
 from femoreg_torch.segment.sphere import refitted_sphere
 from femoreg_torch.volume import read_label_map
 from sim.patient.around_surfaces.surfaces import read_surfaces
@@ -83,8 +84,8 @@ def read_shape(path: Path, spine: BoneShape | None = None) -> BoneShape:
 def check_shapes(paths: list[Path], cache: Path) -> None:
     """Raises `InputError` for a file that is not there, and not in `cache` either."""
     for path in paths:
-        if not path.is_file() and not _kept(path, cache).is_file():
-            raise InputError(f"--shapes: there is no file {path}.")
+        if not _kept(path, cache).is_file() and (why := why_unreadable(path)) is not None:
+            raise InputError(f"--shapes: {path}: {why}")
 
 
 def cached_shapes(paths: list[Path], cache: Path) -> list[BoneShape]:

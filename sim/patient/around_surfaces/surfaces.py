@@ -9,6 +9,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from femoreg_torch.errors import InputError, in_mm
+from femoreg_torch.paths import check_readable
 from femoreg_torch.volume import check_closed
 
 Points = NDArray[np.float64]
@@ -36,8 +37,7 @@ def read_surfaces(path: Path) -> BoneSurfaces:
     The texts `source`, `licence` and `role` in it are kept. Raises `InputError` for a file that is missing or lacks
     something, and for an open surface.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file.")
+    check_readable(path)
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _MOST_BYTES:
