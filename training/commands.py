@@ -25,7 +25,8 @@ def train(
     hip14.safetensors, the moving average of the weights at their best validation loss.
 
     Args:
-        settings: preset in configs/training (hip14, quick, grupp2020), or a YAML file, which may extend one.
+        settings: preset in configs/training (hip14, all_views, quick, grupp2020), or a YAML file, which may extend
+            one.
         out: folder of this run.
         cases: '[FOLDER, …]', patients to learn from beside the procedural ones: case folders, whose case.yaml names CT,
             label map with its table of ids, and landmarks (all 14), or folders with ct.nii.gz, labels.nii.gz (ids of
