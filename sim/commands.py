@@ -110,10 +110,10 @@ def simulate(
     from femoreg_torch.files import check_new_folder
     from sim.theatre.case_folders import SIMULATION_STEPS, write_simulation
 
-    case = case_folder(case)
-    check_new_folder(out, case)
     console = Console()
     place = tell_device(console, device)
+    case = case_folder(case)
+    check_new_folder(out, case)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("reading the patient", total=SIMULATION_STEPS)
