@@ -10,11 +10,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import write_text
 from femoreg_torch.text import json_content
+from sim.patient.writing import ORIGIN_NAME
 from training.cohort import CohortSettings
 from training.module import OptimisationSettings
 from training.settings import TrainingSettings
 
-_ORIGIN = "origin.json"  # beside a patient: where it comes from
 _PAUSE_S = 600.0  # between two values logged: the run had been stopped
 _MEASURES = {  # logged at the end of each epoch, and their columns
     "validation/loss": "loss",
@@ -44,7 +44,7 @@ def data_table(cohort: CohortSettings, cases: Sequence[Path]) -> str:
         "| --- | --- | --- | --- | --- |",
     ]
     for case in cases:
-        licence, source = _origin(case / _ORIGIN)
+        licence, source = _origin(case / ORIGIN_NAME)
         images = cohort.case_variants * cohort.views
         rows.append(f"| {case.resolve().name} | {cohort.case_variants} | {images} | {licence} | {source} |")
     for what, seeds in {"": cohort.patient_seeds, ", to validate on": cohort.validation_seeds}.items():

@@ -35,6 +35,10 @@ _OF_A_SIDE = (
     "This view is taken from a side, and the shipped network knows views from the front and from behind: pick the "
     "landmarks in the image (--landmarks), or put another view first."
 )
+_LOOK_AGAIN = (
+    "Look again which is nearer to the source (and is shown larger), or put a view from the front or from behind first."
+)
+_BY_HAND = "Pick the landmarks in the image (--landmarks), or put a view from the front or from behind first."
 _MOST_ASKEW_DEG = 60.0  # of the beam against the side that the case says; beyond 45° another side is nearer
 GIVEN_DEVIATION_MM = 1.5  # on the detector, along each axis: of landmarks that a person picked in the image
 
@@ -71,7 +75,7 @@ def start_by_detection(case: Case, scene: Scene, detection: Detection, find: Det
                 "in proportion to the light? Export it with 16 bits, or its logarithm."
             ) from error
         if case.display_of(0).source in ("left", "right"):
-            raise InputError(f"{seen} {_OF_A_SIDE}") from error
+            raise InputError(f"{seen.removesuffix(_BY_HAND).rstrip()} {_OF_A_SIDE}") from error
         turned = () if find is None else _told_turned(case, scene, anatomy, find)
         raise InputError(" ".join([seen, *turned])) from error
     stored = case.display_of(0).pixels_to_stored(detection.pixels, case.carm.camera)
@@ -156,7 +160,7 @@ def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) ->
     _check_rotation(pnp)
     _check_beam(pnp.camera_from_object, display)
     if case.anatomy is not None:
-        _check_sides(pnp, case.anatomy, case.landmarks, names, fitted)
+        _check_sides(pnp, case.anatomy, case.landmarks, names, fitted, _LOOK_AGAIN)
     marks = {
         name: LandmarkRecord(_pair(pixels[name]), 1.0, True, inlier)
         for name, inlier in zip(names, pnp.inliers.tolist(), strict=True)
@@ -229,7 +233,7 @@ def find_start(
         too_few = error
         pnp = likely_pose(points, pixels, camera, deviations, spread, beam, detection.turned)
     else:
-        _check_sides(pnp, anatomy, landmarks, used, fitted)
+        _check_sides(pnp, anatomy, landmarks, used, fitted, _BY_HAND)
     if outline is None:
         _check_rotation(pnp)
         return Start(pnp.camera_from_object, pnp, used, None)
@@ -277,8 +281,9 @@ def _check_sides(
     landmarks: Mapping[str, Tensor],
     names: Sequence[str],
     fitted: Callable[[Sequence[str], Sequence[int]], PnpResult],
+    advice: str,
 ) -> None:
-    """Raises `InputError` where landmarks of a view from a side may be those of the other side.
+    """Raises `InputError` with this `advice` where landmarks of a view from a side may be those of the other side.
 
     `fitted` gives the pose if rows of what was seen are the landmarks of given names.
 
@@ -298,9 +303,8 @@ def _check_sides(
     if gain > -_SURE_OF_SIDES:
         how = "better" if gain > _SURE_OF_SIDES else "about as well"
         raise InputError(
-            f"landmarks in the image: with left and right exchanged they fit {how}. This view is taken from a side, "
-            "where the two lie one over the other: look again which is nearer to the source (and is shown larger), or "
-            "put a view from the front or from behind first."
+            f"landmarks in the image: with left and right exchanged they fit {how}. Seen from a side, the two lie one "
+            f"over the other. {advice}"
         )
 
 

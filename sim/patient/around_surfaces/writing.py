@@ -6,9 +6,7 @@ from pathlib import Path
 from femoreg_torch.files import new_folder, write_json
 from sim.patient.around_surfaces.scan import Options, patient_around
 from sim.patient.around_surfaces.surfaces import read_surfaces
-from sim.patient.writing import write_patient
-
-_ORIGIN = "origin.json"
+from sim.patient.writing import ORIGIN_NAME, write_patient
 
 
 def write_patient_around(surfaces: Path, out: Path, options: Options) -> None:
@@ -24,7 +22,7 @@ def write_patient_around(surfaces: Path, out: Path, options: Options) -> None:
     with new_folder(out) as folder:
         write_patient(folder, replace(patient, landmarks=rounded))
         write_json(
-            folder / _ORIGIN,
+            folder / ORIGIN_NAME,
             {
                 "subject": subject.name,
                 **asdict(options),

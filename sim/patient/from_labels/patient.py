@@ -13,7 +13,7 @@ from sim.patient.landmarks import find_landmarks
 from sim.patient.parameters import draw_parameters
 from sim.patient.scan import Patient, scan_skeleton
 from sim.patient.skeleton import LABEL_IDS
-from sim.patient.writing import write_patient
+from sim.patient.writing import ORIGIN_NAME, write_patient
 
 
 def make_label_patient(labels: Volume, bones: LabelTable, seed: int, spacing_mm: float = 1.0) -> Patient:
@@ -52,4 +52,4 @@ def write_label_patient(path: Path, bones: LabelTable, out: Path, seed: int, spa
     with new_folder(out) as folder:
         write_patient(folder, patient)
         origin = {"source": path.name, "licence": "that of the label map", "seed": seed, "spacing_mm": spacing_mm}
-        write_json(folder / "origin.json", {"what": "synthetic CT: bones of a label map, invented HU", **origin})
+        write_json(folder / ORIGIN_NAME, {"what": "synthetic CT: bones of a label map, invented HU", **origin})
