@@ -82,10 +82,12 @@ def _explained(
     found = Misfit(kind, view, fits[image], fits[scene.first_kind, 0])
     if kind != scene.first_kind:
         others = [other for other in range(scene.views) if other != view]
+        if not others:
+            return found
         swapped = replace(scene, images=scene.images | {kind: (scene.images[kind][view],) * scene.views}, fields={})
         seen = _similarities(swapped, poses, [(kind, other) for other in others], imaging)
-        best = max(range(len(others)), key=lambda n: seen[n], default=None)
-        if best is not None and seen[best] > max(found.similarity + _BETTER, _FITS * found.in_view_1):
+        best = max(range(len(others)), key=lambda n: seen[n])
+        if seen[best] > max(found.similarity + _BETTER, _FITS * found.in_view_1):
             return replace(found, as_view=others[best])
         return found
     if scene.camera_from_camera1 is not None or view == 0:

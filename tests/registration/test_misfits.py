@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from registration_scenes import float64, make_scene, true_poses
+from registration_scenes import CARM, float64, make_scene, true_poses
 
 from femoreg_torch.geometry import exp_se3
 from femoreg_torch.registration.doubts import doubts_about_the_images
@@ -72,3 +72,13 @@ def test_images_of_something_else(scene: Scene) -> None:
         assert (found.kind, found.view, found.as_view, found.as_stored) == (kind, 1, None, None)
         assert found.similarity < 0.2 < found.in_view_1
         assert says in doubts_about_the_images(with_image(scene, kind, 1, noise), TRUTH, PLAIN)[0]
+
+
+def test_the_only_device_image_may_be_of_something_else() -> None:
+    """There is no other view that it could have been taken in."""
+    truth = true_poses((0,))
+    noise = torch.rand(CARM.camera.shape, generator=torch.Generator().manual_seed(3))
+    strange = with_image(make_scene(truth), "device", 0, noise)
+    (found,) = misfits(strange, truth, PLAIN)
+    assert (found.kind, found.view, found.as_view, found.as_stored) == ("device", 0, None, None)
+    assert "no images are exchanged" in doubts_about_the_images(strange, truth, PLAIN)[0]
