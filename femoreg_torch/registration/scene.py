@@ -36,7 +36,8 @@ class RigidObject:
     shown_in: tuple[Kind, ...]  # the kinds of images that hold it
     start: Start = field(default_factory=Start)  # where the landmarks put it, if nothing else is said
     classes: tuple[int, ...] = ()  # of the segmentation that show it; none for what the network does not know
-    parts: tuple[Volume, ...] = ()  # of a model, each of one material; on the grid of `volume`, which is their sum
+    # of a model, each of one material; on the grid of `volume`, which is their sum; a bone has none
+    parts: tuple[Volume, ...] = ()
     axis: Axis | None = None  # of a model that is round, as it was told
     materials_known: bool = False  # whether materials were named; the HU of a single solid may be a guess
     sharp: bool = False  # whether it is made of solids with surfaces, over which its voxels average
@@ -163,9 +164,15 @@ class Scene:
 
     @property
     def anchor(self) -> str:
-        """The object that landmarks place; the first one where nothing starts from landmarks."""
-        placed = (name for name, thing in self.objects.items() if thing.start.by_landmarks)
-        return next(placed, next(iter(self.objects)))
+        """The object that landmarks place; where nothing starts from landmarks, the first bone, or else the first one.
+
+        In its space lie the landmarks and the soft tissue, which a model's space has nothing to do with. What no image
+        shows has no pose, and others come before it.
+        """
+        placed = [name for name, thing in self.objects.items() if thing.start.by_landmarks]
+        shown = [name for name, thing in self.objects.items() if self.there(thing.shown_in, range(self.views))]
+        bones = [name for name in shown if not self.objects[name].parts]
+        return next(iter([*placed, *bones, *shown, *self.objects]))
 
     @property
     def needs_landmarks(self) -> bool:

@@ -20,7 +20,7 @@ from femoreg_torch.optimize import parabola_minimum
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level, binning
 from femoreg_torch.registration.objective import ImageCosts, image_costs
-from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene
+from femoreg_torch.registration.scene import Body, Kind, Scene
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume
 
@@ -63,14 +63,14 @@ def tip_length(
     if parted is None:
         return None
     names = f"{name}, without its tip", f"{name}, its tip"
-    rest, end = (
-        RigidObject(part, thing.reference_point, thing.shown_in, sharp=thing.sharp, hardening=thing.hardening)
-        for part in parted
-    )
+    # Each starts as the whole does: one that landmarks seem to place would be the scene's anchor.
+    rest, end = (replace(thing, volume=part, unsure=()) for part in parted)
     shown = [other for other in scene.shown(poses.camera1_from, kind) if other != name]
     for each in names:
         poses = poses.with_object(each, poses.camera1_from[name])
-    objects = {other: scene.objects[other] for other in shown} | dict(zip(names, (rest, end), strict=True))
+    # What these images do not show stays too: the soft tissue may lie in its space.
+    others = {other: scene.objects[other] for other in scene.objects if other != name}
+    objects = others | dict(zip(names, (rest, end), strict=True))
     still = Body((names[1],), 0, tip, torch.ones(6, dtype=torch.float64))
 
     def costs_of(view: int, window: Scene) -> ImageCosts:

@@ -12,8 +12,11 @@ from femoreg_torch.geometry import invert_rigid, rigid
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, load_plan, run_plan
 from femoreg_torch.registration.covariance import pose_covariance
+from femoreg_torch.registration.imaging import Imaging
+from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.stage import run_stage
 from femoreg_torch.similarity import GradNcc
+from femoreg_torch.volume import Volume, axis_aligned
 
 LEVEL = Level(pixel_mm=3.0, step_mm=2.0)
 SIMILARITY = GradNcc(patch_radius=4)
@@ -56,6 +59,42 @@ def test_all_is_one_body_and_each_is_one_for_every_object_that_the_images_show(s
     assert [body.objects for body in EACH.bodies(scene, TRUTH, ["device"], (0,))][2] == ("device",)
     head = torch.cat([REFERENCE_POINTS["femur"], torch.ones(1).double()])
     torch.testing.assert_close(bodies[1].centre, (TRUTH.camera1_from["femur"] @ head)[:3])
+
+
+def device_first(scene: Scene) -> Scene:
+    """The scene with a model before the bones, where every object starts from a pose that was told."""
+    device, pelvis = scene.objects["device"], scene.objects["pelvis"]
+    objects = {
+        "device": replace(device, parts=(device.volume,)),
+        "pelvis": replace(pelvis, start=Start(TRUTH.camera1_from["pelvis"])),
+        "femur": scene.objects["femur"],
+    }
+    return replace(scene, objects=objects)
+
+
+def test_a_bone_is_the_anchor_although_a_model_stands_first(scene: Scene) -> None:
+    """Soft tissue and landmarks lie in its space, and not in that of the model."""
+    assert device_first(scene).anchor == "pelvis"
+    model = device_first(scene).objects["device"]
+    assert replace(scene, objects={"one": model, "other": model}).anchor == "one"
+    body = torch.zeros(30, 30, 30)
+    body[6:24, 6:24, 6:24] = 0.02
+    tissue = Volume(body, axis_aligned((6.0, 6.0, 6.0), (-90.0, -90.0, -90.0)))
+    drawn, expected = (
+        image_costs(
+            replace(each, tissue=tissue), TRUTH, (), list(TRUTH.camera1_from), [("anatomy", 0)], LEVEL, SIMILARITY,
+            imaging=Imaging(tissue=0.75),
+        ).targets[0].tissue
+        for each in (device_first(scene), scene)
+    )  # fmt: skip
+    assert drawn is not None
+    torch.testing.assert_close(drawn, expected)
+
+
+def test_a_model_that_stands_first_needs_no_image() -> None:
+    bones = device_first(make_scene(TRUTH, with_device=False))
+    outcome = run_plan(bones, Plan("mine", STEPS), None, 0)
+    assert list(outcome.poses.camera1_from) == ["pelvis", "femur"]
 
 
 def test_one_body_for_all_keeps_them_together(scene: Scene) -> None:

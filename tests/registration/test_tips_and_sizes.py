@@ -11,9 +11,9 @@ from torch.nn import functional as F
 
 from femoreg_torch.case import Case, CaseObject, Model, Start
 from femoreg_torch.drr import project
-from femoreg_torch.geometry import CArm, centred_camera, project_points, transform_points
+from femoreg_torch.geometry import Camera, CArm, centred_camera, project_points, transform_points
 from femoreg_torch.registration.device_doubts import doubts_about_size, doubts_about_units
-from femoreg_torch.registration.imaging import PLAIN
+from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.registration.sizes import device_size
 from femoreg_torch.registration.tips import _near_the_tip, _parted, _stretched, tip_length
@@ -100,6 +100,26 @@ def test_a_tip_of_another_length_is_told_by_as_much(scene: Scene, mm: float) -> 
     case = replace(CASE, objects={"device": CaseObject("device", points={"base": BASE, "tip": tip})})
     (doubt,) = doubts_about_size(case, wrong, wrong, TRUTH, PLAIN)
     assert ("before the tip of its model" if mm > 0 else "beyond the tip of its model") in doubt
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_soft_tissue_lies_about_the_bones_while_a_tip_is_asked(
+    scene: Scene, given: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not about the parts of the device, whether landmarks or poses that were given place the bones."""
+    drawn_at: list[Tensor] = []
+
+    def tissue_integrals(tissue: Volume, pose: Tensor, camera: Camera) -> Tensor:
+        drawn_at.append(pose)
+        return torch.zeros(camera.shape)
+
+    monkeypatch.setattr("femoreg_torch.registration.objective.tissue_integrals", tissue_integrals)
+    start = Start(TRUTH.camera1_from["pelvis"]) if given else Start()
+    pelvis = replace(scene.objects["pelvis"], start=start)
+    femur = replace(scene.objects["femur"], start=Start(beside="pelvis"))
+    placed = replace(scene, objects=scene.objects | {"pelvis": pelvis, "femur": femur}, tissue=VOLUMES["pelvis"])
+    assert tip_length(placed, TRUTH, "device", "device", (BASE, TIP), Imaging(tissue=0.75)) is not None
+    torch.testing.assert_close(torch.stack(drawn_at), TRUTH.camera_from("pelvis"))
 
 
 def test_a_tip_that_was_estimated_to_be_empty_is_asked_as_it_was_told(scene: Scene) -> None:
