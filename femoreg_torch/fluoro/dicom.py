@@ -201,8 +201,8 @@ def _pixels(dataset: Any, frames: tuple[int, ...]) -> Values:
 def _by_gdcm(dataset: Any) -> Values:
     """Stored values (F, H, W) of a compressed image by GDCM, in SimpleITK, which knows all kinds of JPEG.
 
-    It applies what it finds of rescaling, so it is given the pixels and what describes them alone. Raises
-    `RuntimeError` for what it cannot decode either.
+    It applies what it finds of rescaling, so it is given the pixels and what describes them alone, and turns the values
+    of MONOCHROME1 over, so it is told the other one. Raises `RuntimeError` for what it cannot decode either.
     """
     from pydicom.dataset import Dataset
 
@@ -211,6 +211,8 @@ def _by_gdcm(dataset: Any) -> Values:
     for keyword in _PIXEL_TAGS:
         if keyword in dataset:
             bare.add(dataset[keyword])
+    if bare.get("PhotometricInterpretation") == "MONOCHROME1":
+        bare.add_new("PhotometricInterpretation", "CS", "MONOCHROME2")  # the element of the data set stays as it is
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "image.dcm"
         bare.save_as(path, enforce_file_format=True)

@@ -151,9 +151,10 @@ def test_frames_are_counted_from_one_and_averaged(tmp_path: Path) -> None:
         values(write(tmp_path, run, NumberOfFrames=3, PositionerMotion="DYNAMIC"), frames="mean")
 
 
+@pytest.mark.parametrize("shown", ["MONOCHROME1", "MONOCHROME2"])
 @pytest.mark.parametrize("compressor", ["JPEG", "JPEG2000", "JPEGLS"])  # the first is lossless, and frequent in XA
-def test_compressed_images_are_the_same(tmp_path: Path, compressor: str) -> None:
-    """As SimpleITK packs them; unsigned 12 bits and a rescale, which must not be applied twice."""
+def test_compressed_images_are_the_same(tmp_path: Path, compressor: str, shown: str) -> None:
+    """As SimpleITK packs them; unsigned 12 bits, a rescale and an inversion, which must not be applied twice."""
     pixels = np.random.default_rng(4).integers(0, 4096, (20, 12), dtype=np.uint16)
     writer = sitk.ImageFileWriter()
     writer.UseCompressionOn()
@@ -163,10 +164,11 @@ def test_compressed_images_are_the_same(tmp_path: Path, compressor: str) -> None
     writer.Execute(sitk.GetImageFromArray(pixels))
     packed = pydicom.dcmread(tmp_path / "packed.dcm")
     assert packed.file_meta.TransferSyntaxUID.is_compressed
-    depth = {"BitsStored": packed.BitsStored, "HighBit": packed.HighBit}
-    plain = values(write(tmp_path, pixels, RescaleSlope=0.5, RescaleIntercept=3, **depth))
-    np.testing.assert_array_equal(plain, 0.5 * pixels + 3)
-    path = write(tmp_path, pixels, RescaleSlope=0.5, RescaleIntercept=3, **depth)
+    fields = {"BitsStored": packed.BitsStored, "HighBit": packed.HighBit, "PhotometricInterpretation": shown}
+    path = write(tmp_path, pixels, RescaleSlope=0.5, RescaleIntercept=3, **fields)
+    plain = values(path)
+    dark_is_low = pixels if shown == "MONOCHROME2" else 2.0**packed.BitsStored - 1 - pixels
+    np.testing.assert_array_equal(plain, 0.5 * dark_is_low + 3)
     dataset = pydicom.dcmread(path)
     dataset.file_meta.TransferSyntaxUID = packed.file_meta.TransferSyntaxUID
     dataset.add(packed["PixelData"])
