@@ -45,6 +45,7 @@ class DicomImage:
     padding: NDArray[np.bool_] | None  # (H, W) pixels that hold no image
     remarks: tuple[str, ...]  # for the user
     asks: str | None  # what the header leaves open and the case has to say: a question in words
+    bone_is_dark: bool = False  # whether the header says so of the values, and not what they are
 
 
 def carm_settings(path: Path) -> dict[str, Any]:
@@ -148,7 +149,7 @@ def _read(path: Path, frames: Frames | None) -> DicomImage:
         asks = f"is a radiograph ({tags.modality}) and does not say what its values are (PixelIntensityRelationship)"
     if str(dataset.get("LossyImageCompression") or "") == "01":
         remarks.append("was compressed with loss")
-    return DicomImage(values, tags, intensity, padding, tuple(remarks), asks)
+    return DicomImage(values, tags, intensity, padding, tuple(remarks), asks, intensity is None and sign is not None)
 
 
 def _numbers(dataset: Any, frames: Frames | None, path: Path) -> tuple[int, ...]:

@@ -132,6 +132,22 @@ def test_logarithms_without_a_lut_have_bright_bone(tmp_path: Path, fields: dict,
     assert "unknown base" in read.remarks[0]
 
 
+@pytest.mark.parametrize("relationship", [{"PixelIntensityRelationship": "DISP"}, {"Modality": "DX"}])
+@pytest.mark.parametrize("shown", ["MONOCHROME1", "MONOCHROME2"])
+def test_a_sign_says_where_bone_is_dark_whatever_the_case_says_of_values(
+    tmp_path: Path, relationship: dict, shown: str
+) -> None:
+    """A radiograph is shown with bone bright, so that its user says `log`."""
+    for sign, light in ((1, PIXELS), (-1, 4095 - PIXELS)):
+        signed = {"PhotometricInterpretation": shown, "PixelIntensityRelationshipSign": sign} | relationship
+        read = read_stored(write(tmp_path, **signed))
+        assert read.intensity is None
+        np.testing.assert_array_equal(read.values_as("raw").numpy(), light)
+        np.testing.assert_array_equal(read.values_as("log").numpy(), float(light.max()) - light)
+    read = read_stored(write(tmp_path, PhotometricInterpretation=shown, **relationship))  # as it is shown
+    np.testing.assert_array_equal(read.values_as("log").numpy(), PIXELS if shown == "MONOCHROME2" else 4095 - PIXELS)
+
+
 def test_windows_are_for_looking_only(tmp_path: Path) -> None:
     path = write(tmp_path, WindowCenter=100, WindowWidth=50, VOILUTSequence=[lut(0, np.zeros(4096, np.uint16))])
     np.testing.assert_array_equal(values(path), PIXELS)
