@@ -6,6 +6,7 @@ import numpy as np
 import pydicom
 import pytest
 import SimpleITK as sitk
+import torch
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import (
     MPEG2MPML,
@@ -313,6 +314,23 @@ def test_padding_and_shutters_are_no_image(tmp_path: Path) -> None:
     square = {"CollimatorShape": "RECTANGULAR"} | {f"Collimator{name}Edge": n for name, n in edges.items()}
     corners = ((1.0, 0.0), (5.0, 0.0), (5.0, 3.0), (1.0, 3.0))
     assert read_stored(write(tmp_path, **square)).tags.field == Polygon(corners)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("blades", ["Shutter", "Collimator"])
+def test_blades_within_a_round_shutter_leave_what_lies_in_both(tmp_path: Path, blades: str) -> None:
+    """As arms of an intensifier tell them: the round screen as a display shutter, the blades in a tag of their own."""
+    names = ("LeftVertical", "RightVertical", "UpperHorizontal", "LowerHorizontal")
+    told_by: dict[str, object] = {f"{blades}{name}Edge": n for name, n in zip(names, (3, 7, 1, 4), strict=True)}
+    told_by |= {"CenterOfCircularShutter": [3, 4], "RadiusOfCircularShutter": 2}
+    told_by["ShutterShape"] = ["RECTANGULAR", "CIRCULAR"] if blades == "Shutter" else "CIRCULAR"
+    if blades == "Collimator":
+        told_by["CollimatorShape"] = "RECTANGULAR"
+    field = read_header(write(tmp_path, **told_by)).field
+    assert field is not None
+    round_, square = Circle((3.0, 2.0), 2.0), Polygon(((2.0, 0.0), (6.0, 0.0), (6.0, 3.0), (2.0, 3.0)))
+    assert torch.equal(field.exposed((5, 7)), round_.exposed((5, 7)) & square.exposed((5, 7)))
+    unknown = {f"Collimator{name}Edge": 0 for name in names} | {"CollimatorShape": "RECTANGULAR"}
+    assert read_header(write(tmp_path, **unknown)).field is None
 
 
 _USUAL = Display()
