@@ -122,7 +122,12 @@ def _numbers(dataset: Any, keyword: str, count: int) -> list[float] | None:
 
 
 def _source(dataset: Any) -> float | None:
-    """Where the source stands about the patient, degrees: from the positioner's angle, or from the view's name."""
+    """Where the source stands about the patient, degrees: from the positioner's angle, or from the view's name.
+
+    Of a run during which the arm moved these tell where it began, unless they are told of each frame.
+    """
+    if dataset.get("PositionerMotion") == "DYNAMIC" and not dataset.get("PerFrameFunctionalGroupsSequence"):
+        return None
     primary = _numbers(dataset, "PositionerPrimaryAngle", 1) or _numbers(dataset, "PositionerIsocenterPrimaryAngle", 1)
     if primary is None:
         return _VIEWS.get(str(find_value(dataset, "ViewPosition")))

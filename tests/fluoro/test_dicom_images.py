@@ -369,6 +369,19 @@ def test_the_side_of_the_source(tmp_path: Path, tags: dict, sides: set[str]) -> 
     assert fits == sides
 
 
+def test_the_angle_of_a_spin_is_that_of_its_beginning_and_says_nothing_of_a_frame(tmp_path: Path) -> None:
+    run = np.stack([PIXELS, PIXELS[::-1], PIXELS[:, ::-1]])
+    spin = {"PositionerMotion": "DYNAMIC", "PositionerPrimaryAngle": -90, "PositionerPrimaryAngleIncrement": 90}
+    read = read_stored(
+        write(tmp_path, run, NumberOfFrames=3, **spin), (2,)
+    ).tags  # from behind, where it began at the left
+    assert read is not None
+    assert read.source_deg is None
+    assert not contradictions(read, CAMERA, Display("posterior"), None)
+    still = read_header(write(tmp_path, run, NumberOfFrames=3, **spin | {"PositionerMotion": "STATIC"}))
+    assert still.source_deg == 90
+
+
 @pytest.mark.parametrize(
     ("orientation", "display"),
     [
