@@ -18,7 +18,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import ReferencePoints, reference_points
 from femoreg_torch.evaluation.overlay import monitor_picture
 from femoreg_torch.files import new_folder, temporary_file, write_json
-from femoreg_torch.fluoro import read_image, write_image
+from femoreg_torch.fluoro import read_stored, settled_intensity, write_image
 from femoreg_torch.geometry import Camera
 from femoreg_torch.pictures import write_picture
 from femoreg_torch.volume import read_ct, write_volume
@@ -26,6 +26,7 @@ from femoreg_torch.volume import read_ct, write_volume
 UNCERTAINTY_NAME, BEADS_NAME, PICTURE_NAME = "truth_uncertainty.json", "beads.csv", "beads.png"
 CT_NAME = "ct.nii.gz"
 _VERSION = 1
+_WHITE = 65535  # of 16 bits
 _PANEL_PX = 768  # of one image in the picture
 _YELLOW, _RED = (0, 220, 255), (60, 60, 255)  # blue, green, red
 
@@ -110,9 +111,13 @@ def _clean_view(folder: Path, out: Path, case: Case, found: Measured, number: in
     view, images = case.views[number], {}
     for kind, path in view.images.items():
         centres, radii = _shadows(case, found, number, kind)
-        image = image_without(read_image(path, view.frames), centres, radii, case.carm.camera)
-        if view.intensity == "log" or image.min() < 0 or image.max() > 65535:
+        stored = read_stored(path, view.frames)
+        image = image_without(stored.values, centres, radii, case.carm.camera)
+        settled = settled_intensity(view.intensity, stored, str(path))
+        if settled == "log" or image.min() < 0 or image.max() > _WHITE:
             raise InputError(f"{path}: raw images of 16 bits are written without beads; this one is none.")
+        if (stored.values != stored.values.round()).any():  # any scale will do, and rounding is not to be seen
+            image = image * (_WHITE / image.max())
         name = f"view{number + 1}_{kind}.tif"
         write_image(folder / name, image.round().to(torch.uint16))
         images[kind] = out / name

@@ -68,8 +68,8 @@ def detect(
         check_matches(image.values, as_shown, f"{path}:")
     attenuation, detections = [], []
     for path, image in zip(images, stored, strict=True):
-        upright = display.to_camera(image.values)
-        raw = settled_intensity(intensity, image, str(path)) == "raw"
+        settled = settled_intensity(intensity, image, str(path))
+        upright, raw = display.to_camera(image.values_as(settled)), settled == "raw"
         field = exposed_field(upright if raw else intensity_of(upright), camera)
         shown = attenuation_image(upright, field) if raw else upright
         shown = shown if field is None else filled(shown, field)

@@ -45,6 +45,7 @@ class DicomImage:
     padding: NDArray[np.bool_] | None  # (H, W) pixels that hold no image
     remarks: tuple[str, ...]  # for the user
     asks: str | None  # what the header leaves open and the case has to say: a question in words
+    bone_is_dark: bool = False  # whether the header says so of the values, and not what they are
 
 
 def carm_settings(path: Path) -> dict[str, Any]:
@@ -148,7 +149,7 @@ def _read(path: Path, frames: Frames | None) -> DicomImage:
         asks = f"is a radiograph ({tags.modality}) and does not say what its values are (PixelIntensityRelationship)"
     if str(dataset.get("LossyImageCompression") or "") == "01":
         remarks.append("was compressed with loss")
-    return DicomImage(values, tags, intensity, padding, tuple(remarks), asks)
+    return DicomImage(values, tags, intensity, padding, tuple(remarks), asks, intensity is None and sign is not None)
 
 
 def _numbers(dataset: Any, frames: Frames | None, path: Path) -> tuple[int, ...]:
@@ -201,8 +202,8 @@ def _pixels(dataset: Any, frames: tuple[int, ...]) -> Values:
 def _by_gdcm(dataset: Any) -> Values:
     """Stored values (F, H, W) of a compressed image by GDCM, in SimpleITK, which knows all kinds of JPEG.
 
-    It applies what it finds of rescaling, so it is given the pixels and what describes them alone. Raises
-    `RuntimeError` for what it cannot decode either.
+    It applies what it finds of rescaling, so it is given the pixels and what describes them alone, and turns the values
+    of MONOCHROME1 over, so it is told the other one. Raises `RuntimeError` for what it cannot decode either.
     """
     from pydicom.dataset import Dataset
 
@@ -211,6 +212,8 @@ def _by_gdcm(dataset: Any) -> Values:
     for keyword in _PIXEL_TAGS:
         if keyword in dataset:
             bare.add(dataset[keyword])
+    if bare.get("PhotometricInterpretation") == "MONOCHROME1":
+        bare.add_new("PhotometricInterpretation", "CS", "MONOCHROME2")  # the element of the data set stays as it is
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "image.dcm"
         bare.save_as(path, enforce_file_format=True)

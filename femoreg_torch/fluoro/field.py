@@ -38,6 +38,20 @@ class Polygon:
         return inside
 
 
+@dataclass(frozen=True)
+class Overlap:
+    """What several shutters leave that lie over one another."""
+
+    shapes: tuple[Circle | Polygon, ...]
+
+    def exposed(self, shape: tuple[int, int]) -> Tensor:
+        """The pixels (H, W), bool, that lie in all of them."""
+        inside = torch.ones(shape, dtype=torch.bool)
+        for one in self.shapes:
+            inside &= one.exposed(shape)
+        return inside
+
+
 def _pixels(shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Columns (1, W) and rows (H, 1)."""
     rows, columns = (torch.arange(n, dtype=torch.float64) for n in shape)

@@ -49,6 +49,14 @@ class StoredImage:
     padding: Tensor | None = None  # (H, W) bool: pixels that hold no image
     remarks: tuple[str, ...] = ()  # for the user, after the name of the file
     asks: str | None = None  # why the case has to say what the values are
+    bone_is_dark: bool = False  # whether the file says so of the values, and not what they are
+
+    def values_as(self, intensity: Literal["raw", "log"]) -> Tensor:
+        """The values (H, W), as the case says what they are: bone dark in intensities, bright in logarithms.
+
+        Where the header tells which way they run, they run so, however a viewer shows them.
+        """
+        return self.values.max() - self.values if intensity == "log" and self.bone_is_dark else self.values
 
 
 def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -148,7 +156,7 @@ def read_stored(path: Path, frames: Frames | None = None) -> StoredImage:
         looks_log = lowest > -1 and _LOG_RANGE[0] < highest < _LOG_RANGE[1] and bool((image != image.round()).any())
         return StoredImage(image, remarks=remarks, asks=LOOKS_LOG if looks_log else None)
     padding = None if dicom.padding is None else torch.from_numpy(dicom.padding)
-    return StoredImage(image, dicom.intensity, dicom.tags, padding, remarks, dicom.asks)
+    return StoredImage(image, dicom.intensity, dicom.tags, padding, remarks, dicom.asks, dicom.bone_is_dark)
 
 
 def may_be_image(path: Path) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro.display import Display, Source
-from femoreg_torch.fluoro.field import Circle, Polygon
+from femoreg_torch.fluoro.field import Circle, Overlap, Polygon
 from femoreg_torch.geometry import Camera, Uncertainty
 
 _NEAR_DEG = 75.0  # of a source from the middle of its side: half an orbit search, and a patient who lies askew
@@ -35,7 +35,7 @@ class Tags:
     principal_point_px: tuple[float, float] | None = None  # where the middle of the detector lies in the picture
     source_deg: float | None = None  # where the source stands about the patient, from the front to the patient's left
     orientation: tuple[str, str] | None = None  # where rows, and columns, of the picture lead: L, R, A, P, H or F
-    field: Circle | Polygon | None = None  # what a shutter or collimator leaves
+    field: Circle | Polygon | Overlap | None = None  # what shutters and collimators leave
     flipped: bool | None = None  # whether the picture is a mirror image of what the detector read
 
     def display(self, source: Source) -> Display | None:
@@ -79,7 +79,7 @@ def read_tags(dataset: Any) -> Tags:
         principal_point_px=_middle_of_detector(dataset, shape, pixel),
         source_deg=_source(dataset),
         orientation=_orientation(dataset),
-        field=_shutter(dataset, "Shutter") or _shutter(dataset, "Collimator"),
+        field=_field(dataset, shape),
         flipped={"YES": True, "NO": False}.get(str(find_value(dataset, "FieldOfViewHorizontalFlip"))),
     )
 
@@ -122,7 +122,12 @@ def _numbers(dataset: Any, keyword: str, count: int) -> list[float] | None:
 
 
 def _source(dataset: Any) -> float | None:
-    """Where the source stands about the patient, degrees: from the positioner's angle, or from the view's name."""
+    """Where the source stands about the patient, degrees: from the positioner's angle, or from the view's name.
+
+    Of a run during which the arm moved these tell where it began, unless they are told of each frame.
+    """
+    if dataset.get("PositionerMotion") == "DYNAMIC" and not dataset.get("PerFrameFunctionalGroupsSequence"):
+        return None
     primary = _numbers(dataset, "PositionerPrimaryAngle", 1) or _numbers(dataset, "PositionerIsocenterPrimaryAngle", 1)
     if primary is None:
         return _VIEWS.get(str(find_value(dataset, "ViewPosition")))
@@ -162,10 +167,20 @@ def _middle_of_detector(
     return (shape[1] - 1) / 2 + right / pixel[1], (shape[0] - 1) / 2 + down / pixel[0]
 
 
-def _shutter(dataset: Any, kind: str) -> Circle | Polygon | None:
-    """What a display shutter or a collimator leaves (C.7.6.11, C.8.7.3).
+def _field(dataset: Any, shape: tuple[int, int] | None) -> Circle | Polygon | Overlap | None:
+    """What all that a header tells leaves: a round display shutter, say, and the blades of a collimator within.
 
-    Headers count pixels from 1, row before column. Of several shapes in one image the first is taken, circles first.
+    A collimator that leaves nothing, as edges of 0 in place of unknown ones do, is passed over.
+    """
+    blades = [one for one in _shapes(dataset, "Collimator") if shape is None or one.exposed(shape).any()]
+    shapes = (*_shapes(dataset, "Shutter"), *blades)
+    return Overlap(shapes) if len(shapes) > 1 else next(iter(shapes), None)
+
+
+def _shapes(dataset: Any, kind: str) -> Iterator[Circle | Polygon]:
+    """The shapes of a display shutter or a collimator, which lie over one another (C.7.6.11, C.8.7.3).
+
+    Headers count pixels from 1, row before column.
     """
     shapes = dataset.get(f"{kind}Shape")
     shapes = [shapes] if isinstance(shapes, str) else list(shapes or ())
@@ -175,7 +190,7 @@ def _shutter(dataset: Any, kind: str) -> Circle | Polygon | None:
             _numbers(dataset, f"RadiusOfCircular{kind}", 1),
         )
         if centre is not None and radius is not None and radius[0] > 0:
-            return Circle((centre[1] - 1, centre[0] - 1), radius[0])
+            yield Circle((centre[1] - 1, centre[0] - 1), radius[0])
     if "RECTANGULAR" in shapes:
         edges = [
             _numbers(dataset, f"{kind}{edge}Edge", 1)
@@ -183,13 +198,12 @@ def _shutter(dataset: Any, kind: str) -> Circle | Polygon | None:
         ]
         if all(edge is not None for edge in edges):
             left, right, upper, lower = (edge[0] - 1 for edge in edges if edge is not None)
-            return Polygon(((left, upper), (right, upper), (right, lower), (left, lower)))
+            yield Polygon(((left, upper), (right, upper), (right, lower), (left, lower)))
     if "POLYGONAL" in shapes and (value := dataset.get(f"VerticesOfThePolygonal{kind}")) is not None:
         numbers = [float(v) for v in value]
         if len(numbers) >= 6 and len(numbers) % 2 == 0:
             corners = zip(numbers[1::2], numbers[::2], strict=True)
-            return Polygon(tuple((column - 1, row - 1) for column, row in corners))
-    return None
+            yield Polygon(tuple((column - 1, row - 1) for column, row in corners))
 
 
 def contradictions(tags: Tags, camera: Camera, display: Display, uncertainty: Uncertainty | None) -> list[str]:

@@ -331,9 +331,10 @@ def _read_image(case: Case, index: int, kind: Kind) -> _Image:
     check_matches(stored.values, as_stored, where)
     file = f"{where}: {view.images[kind].name}"
     check_header(stored.tags, as_stored, display, case.carm.uncertainty, file)
-    logarithms = settled_intensity(view.intensity, stored, file) == "log"
-    light = intensity_of(stored.values) if logarithms else stored.values
-    values, mended = without_defects(stored.values, light, as_stored.mean_pixel_mm)
+    intensity = settled_intensity(view.intensity, stored, file)
+    logarithms, told_values = intensity == "log", stored.values_as(intensity)
+    light = intensity_of(told_values) if logarithms else told_values
+    values, mended = without_defects(told_values, light, as_stored.mean_pixel_mm)
     distortion = view_distortion(case, index)
     straight = values if distortion is None else distortion.straightened(values)
     image = display.to_camera(straight)

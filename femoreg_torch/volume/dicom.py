@@ -31,7 +31,7 @@ _UNDEFINED = 0xFFFFFFFF  # length of compressed pixels
 _AIR_HU = -1024.0  # what lies outside the slices of a tilted gantry
 _NOT_DICOM = {".gz", ".nii", ".nrrd", ".mha", ".mhd", ".json", ".txt", ".png", ".jpg", ".tif", ".tiff", ".zip", ".stl"}
 _SAME_PLACE_MM = 0.01  # slices that are closer are one
-_STEP = 0.02  # of a slice's step: what rounding of positions may make of it
+_SHEAR_MM = 0.3  # of the last slice against the first: what rounding of positions and axes may make of it
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:
     image.SetSpacing([float(value) for value in spacing])
     image.SetDirection(layout.axes.ravel().tolist())
     lean = layout.step - (layout.step @ layout.axes[:, 2]) * layout.axes[:, 2]
-    if np.linalg.norm(lean) <= _STEP * np.linalg.norm(layout.step):
+    if np.linalg.norm(lean) * (len(layout.slices) - 1) <= _SHEAR_MM:  # which adds up from slice to slice
         return image, ()
     angle = np.degrees(np.arcsin(np.linalg.norm(lean) / np.linalg.norm(layout.step)))
     note = f"the gantry was tilted by {angle:.1f}°: the slices of {where} were brought onto a rectangular grid"

@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 import trimesh
 import yaml
+from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
 
 from femoreg_torch.beads import find_spots, read_trials
 from femoreg_torch.case import ObjectQuality, Result, read_case, result_content, write_json
@@ -174,6 +177,45 @@ def test_beads_give_the_truth_and_are_taken_out(
     entry, *_ = rows
     assert float(entry["value"]) == pytest.approx(0, abs=1e-6)
     assert float(entry["beads_alone"]) == pytest.approx(trial.truth["entry_point_mm"])
+
+
+def test_fractions_are_not_rounded_away_where_beads_are_taken_out(folder: Path, tmp_path: Path) -> None:
+    """Any scale of raw images will do, as that of images from 0 to 1."""
+    for path in folder.glob("v?_*.tif"):
+        tifffile.imwrite(path, read_image(path).numpy() / 65535)
+    assert main(["beads", str(folder), "--beads", str(folder / "beads.yaml"), "--out", str(tmp_path / "out")]) == 0
+    for path in folder.glob("v?_*.tif"):
+        cleaned = tmp_path / "out" / f"view{path.name[1:]}"
+        before, after = attenuation_image(read_image(path)), attenuation_image(read_image(cleaned))
+        assert ((before - after).abs() < 0.01).float().mean() > 0.95  # all but the beads
+
+
+def test_logarithms_by_a_header_are_not_written_as_intensities_without_beads(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (folder / "case.yaml").read_text(encoding="utf-8")
+    for path in folder.glob("v?_*.tif"):
+        logarithms = (3000 - 800 * attenuation_image(read_image(path))).round().clamp(0, 4095).numpy()
+        _write_logarithms(path.with_suffix(".dcm"), logarithms.astype(np.uint16))
+    (folder / "case.yaml").write_text(text.replace(".tif", ".dcm"), encoding="utf-8")
+    assert main(["beads", str(folder), "--beads", str(folder / "beads.yaml"), "--out", str(tmp_path / "out")]) == 2
+    assert "raw images of 16 bits are written without beads" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
+def _write_logarithms(path: Path, pixels: np.ndarray) -> None:
+    """A DICOM image whose header says that it holds logarithms."""
+    dataset = Dataset()
+    dataset.file_meta = FileMetaDataset()
+    dataset.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    dataset.SOPClassUID = dataset.file_meta.MediaStorageSOPClassUID = XRayAngiographicImageStorage
+    dataset.SOPInstanceUID = dataset.file_meta.MediaStorageSOPInstanceUID = "1.2.3"
+    dataset.Modality, dataset.PixelIntensityRelationship = "XA", "LOG"
+    dataset.Rows, dataset.Columns = pixels.shape
+    dataset.SamplesPerPixel, dataset.PhotometricInterpretation = 1, "MONOCHROME2"
+    dataset.BitsAllocated, dataset.BitsStored, dataset.HighBit, dataset.PixelRepresentation = 16, 12, 11, 0
+    dataset.PixelData = pixels.tobytes()
+    dataset.save_as(path, enforce_file_format=True)
 
 
 @pytest.mark.parametrize(

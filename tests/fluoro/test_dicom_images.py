@@ -6,6 +6,7 @@ import numpy as np
 import pydicom
 import pytest
 import SimpleITK as sitk
+import torch
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import (
     MPEG2MPML,
@@ -132,6 +133,22 @@ def test_logarithms_without_a_lut_have_bright_bone(tmp_path: Path, fields: dict,
     assert "unknown base" in read.remarks[0]
 
 
+@pytest.mark.parametrize("relationship", [{"PixelIntensityRelationship": "DISP"}, {"Modality": "DX"}])
+@pytest.mark.parametrize("shown", ["MONOCHROME1", "MONOCHROME2"])
+def test_a_sign_says_where_bone_is_dark_whatever_the_case_says_of_values(
+    tmp_path: Path, relationship: dict, shown: str
+) -> None:
+    """A radiograph is shown with bone bright, so that its user says `log`."""
+    for sign, light in ((1, PIXELS), (-1, 4095 - PIXELS)):
+        signed = {"PhotometricInterpretation": shown, "PixelIntensityRelationshipSign": sign} | relationship
+        read = read_stored(write(tmp_path, **signed))
+        assert read.intensity is None
+        np.testing.assert_array_equal(read.values_as("raw").numpy(), light)
+        np.testing.assert_array_equal(read.values_as("log").numpy(), float(light.max()) - light)
+    read = read_stored(write(tmp_path, PhotometricInterpretation=shown, **relationship))  # as it is shown
+    np.testing.assert_array_equal(read.values_as("log").numpy(), PIXELS if shown == "MONOCHROME2" else 4095 - PIXELS)
+
+
 def test_windows_are_for_looking_only(tmp_path: Path) -> None:
     path = write(tmp_path, WindowCenter=100, WindowWidth=50, VOILUTSequence=[lut(0, np.zeros(4096, np.uint16))])
     np.testing.assert_array_equal(values(path), PIXELS)
@@ -151,9 +168,10 @@ def test_frames_are_counted_from_one_and_averaged(tmp_path: Path) -> None:
         values(write(tmp_path, run, NumberOfFrames=3, PositionerMotion="DYNAMIC"), frames="mean")
 
 
+@pytest.mark.parametrize("shown", ["MONOCHROME1", "MONOCHROME2"])
 @pytest.mark.parametrize("compressor", ["JPEG", "JPEG2000", "JPEGLS"])  # the first is lossless, and frequent in XA
-def test_compressed_images_are_the_same(tmp_path: Path, compressor: str) -> None:
-    """As SimpleITK packs them; unsigned 12 bits and a rescale, which must not be applied twice."""
+def test_compressed_images_are_the_same(tmp_path: Path, compressor: str, shown: str) -> None:
+    """As SimpleITK packs them; unsigned 12 bits, a rescale and an inversion, which must not be applied twice."""
     pixels = np.random.default_rng(4).integers(0, 4096, (20, 12), dtype=np.uint16)
     writer = sitk.ImageFileWriter()
     writer.UseCompressionOn()
@@ -163,10 +181,11 @@ def test_compressed_images_are_the_same(tmp_path: Path, compressor: str) -> None
     writer.Execute(sitk.GetImageFromArray(pixels))
     packed = pydicom.dcmread(tmp_path / "packed.dcm")
     assert packed.file_meta.TransferSyntaxUID.is_compressed
-    depth = {"BitsStored": packed.BitsStored, "HighBit": packed.HighBit}
-    plain = values(write(tmp_path, pixels, RescaleSlope=0.5, RescaleIntercept=3, **depth))
-    np.testing.assert_array_equal(plain, 0.5 * pixels + 3)
-    path = write(tmp_path, pixels, RescaleSlope=0.5, RescaleIntercept=3, **depth)
+    fields = {"BitsStored": packed.BitsStored, "HighBit": packed.HighBit, "PhotometricInterpretation": shown}
+    path = write(tmp_path, pixels, RescaleSlope=0.5, RescaleIntercept=3, **fields)
+    plain = values(path)
+    dark_is_low = pixels if shown == "MONOCHROME2" else 2.0**packed.BitsStored - 1 - pixels
+    np.testing.assert_array_equal(plain, 0.5 * dark_is_low + 3)
     dataset = pydicom.dcmread(path)
     dataset.file_meta.TransferSyntaxUID = packed.file_meta.TransferSyntaxUID
     dataset.add(packed["PixelData"])
@@ -297,6 +316,23 @@ def test_padding_and_shutters_are_no_image(tmp_path: Path) -> None:
     assert read_stored(write(tmp_path, **square)).tags.field == Polygon(corners)  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize("blades", ["Shutter", "Collimator"])
+def test_blades_within_a_round_shutter_leave_what_lies_in_both(tmp_path: Path, blades: str) -> None:
+    """As arms of an intensifier tell them: the round screen as a display shutter, the blades in a tag of their own."""
+    names = ("LeftVertical", "RightVertical", "UpperHorizontal", "LowerHorizontal")
+    told_by: dict[str, object] = {f"{blades}{name}Edge": n for name, n in zip(names, (3, 7, 1, 4), strict=True)}
+    told_by |= {"CenterOfCircularShutter": [3, 4], "RadiusOfCircularShutter": 2}
+    told_by["ShutterShape"] = ["RECTANGULAR", "CIRCULAR"] if blades == "Shutter" else "CIRCULAR"
+    if blades == "Collimator":
+        told_by["CollimatorShape"] = "RECTANGULAR"
+    field = read_header(write(tmp_path, **told_by)).field
+    assert field is not None
+    round_, square = Circle((3.0, 2.0), 2.0), Polygon(((2.0, 0.0), (6.0, 0.0), (6.0, 3.0), (2.0, 3.0)))
+    assert torch.equal(field.exposed((5, 7)), round_.exposed((5, 7)) & square.exposed((5, 7)))
+    unknown = {f"Collimator{name}Edge": 0 for name in names} | {"CollimatorShape": "RECTANGULAR"}
+    assert read_header(write(tmp_path, **unknown)).field is None
+
+
 _USUAL = Display()
 
 
@@ -331,6 +367,19 @@ def test_lengths_of_header_and_case(tmp_path: Path) -> None:
 def test_the_side_of_the_source(tmp_path: Path, tags: dict, sides: set[str]) -> None:
     fits = {side for side in SOURCES if not told(tmp_path, Display(side), **tags)}
     assert fits == sides
+
+
+def test_the_angle_of_a_spin_is_that_of_its_beginning_and_says_nothing_of_a_frame(tmp_path: Path) -> None:
+    run = np.stack([PIXELS, PIXELS[::-1], PIXELS[:, ::-1]])
+    spin = {"PositionerMotion": "DYNAMIC", "PositionerPrimaryAngle": -90, "PositionerPrimaryAngleIncrement": 90}
+    read = read_stored(
+        write(tmp_path, run, NumberOfFrames=3, **spin), (2,)
+    ).tags  # from behind, where it began at the left
+    assert read is not None
+    assert read.source_deg is None
+    assert not contradictions(read, CAMERA, Display("posterior"), None)
+    still = read_header(write(tmp_path, run, NumberOfFrames=3, **spin | {"PositionerMotion": "STATIC"}))
+    assert still.source_deg == 90
 
 
 @pytest.mark.parametrize(

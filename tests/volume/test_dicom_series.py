@@ -31,6 +31,7 @@ from femoreg_torch.volume import (
     read_label_map,
     read_labels_told,
     read_volume,
+    read_volume_told,
     segment_names,
 )
 from femoreg_torch.volume.dicom import series_in
@@ -202,6 +203,25 @@ def test_a_tilted_gantry_is_straightened(tmp_path: Path) -> None:
     assert inside.sum() > 0.8 * values.size
     assert (found[(stored < -0.6).any(1)] == -1024).all()
     np.testing.assert_allclose(found[inside], (500 - 1024 + 40 * (where - ORIGIN) @ [1.0, 2.0, 1.5])[inside], atol=1)
+
+
+@pytest.mark.parametrize(("tilt_deg", "straightened"), [(0.02, False), (0.3, True), (1.0, True)])
+def test_a_slight_tilt_of_the_gantry_adds_up_over_many_slices(
+    tmp_path: Path, tilt_deg: float, straightened: bool
+) -> None:
+    """A degree shears a CT of 300 mm by 5 mm."""
+    count, tilt = 121, np.radians(tilt_deg)
+    axes = Rotation.from_euler("x", tilt).as_matrix()
+    lean = STEP_MM * (np.array([0, 0, 1 / np.cos(tilt)]) - axes[:, 2])
+    k, row, column = np.meshgrid(np.arange(count), np.arange(14), np.arange(5), indexing="ij")
+    along = np.stack([column * PIXEL[1], row * PIXEL[0], k * STEP_MM], -1)
+    places = along @ axes.T + k[..., None] * lean  # from the centre of the first voxel
+    write_series(tmp_path / "ct", axes, lean=lean, values=np.rint(5000 + 40 * places[..., 1]).astype(np.int16))
+    volume, told = read_volume_told(tmp_path / "ct")
+    assert bool(told) == straightened
+    x, y, z = volume.data.shape[2] // 2, volume.data.shape[1] // 2, volume.data.shape[0] - 2
+    where = volume.lps_from_index.numpy() @ [x, y, z, 1]
+    assert (float(volume.data[z, y, x]) + 1024 - 5000) / 40 == pytest.approx(where[1] - ORIGIN[1], abs=0.3)
 
 
 def test_one_of_several_series_is_chosen(tmp_path: Path) -> None:
