@@ -35,7 +35,7 @@ _SCREEN_SUFFIXES = (".jpg", ".jpeg", ".bmp")  # what nobody stores intensities i
 LOOKS_LOG = "looks like logarithms already"  # what a file of fractions asks the case about
 _LOG_RANGE = (2.0, 20.0)  # of the greatest attenuation in an image: 45 cm of water at 60 keV are 9
 _MOST_PICTURE_BYTES = 2**28  # what the most pixels have as floats
-_PHOTOMETRIC_INTERPRETATION = 262  # a tag of TIFF
+_BITS_PER_SAMPLE, _PHOTOMETRIC_INTERPRETATION, _SAMPLES_PER_PIXEL = 258, 262, 277  # tags of TIFF
 _GREY_STEPS = 12  # by which the colours of a grey JPEG may differ
 
 
@@ -78,8 +78,8 @@ def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
         raise InputError(
             f"{path}: says that it is to be shown turned or mirrored (EXIF). Save it as it is to be shown."
         )
-    if path.suffix.lower() in _PAGED_SUFFIXES and image.dtype != np.uint8 and _white_is_zero(content):
-        raise InputError(f"{path}: says that 0 is white (WhiteIsZero). Save it with 0 as black (BlackIsZero).")
+    if path.suffix.lower() in _PAGED_SUFFIXES:
+        _check_tiff(path, content, image)
     screen = path.suffix.lower() in _SCREEN_SUFFIXES or (path.suffix.lower() == ".png" and image.dtype == np.uint8)
     if image.ndim == 3 and image.shape[-1] in (3, 4):
         colours = image[..., :3].astype(np.int64)
@@ -88,8 +88,24 @@ def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     return image, (SCREEN,) if screen else ()
 
 
-def _white_is_zero(tiff: bytes) -> bool:
-    """Whether a TIFF file says that its least value is white; OpenCV turns over those of 8 bits alone.
+def _check_tiff(path: Path, content: bytes, image: np.ndarray) -> None:
+    """Raises `InputError` for a TIFF file whose values OpenCV gives otherwise than they are meant.
+
+    It turns those of 8 bits over alone where 0 is white. Of grey values of more bits beside other channels it gives the
+    upper 8 bits, or mixes the channels.
+    """
+    bits, channels = (_tiff_tag(content, tag) or 1 for tag in (_BITS_PER_SAMPLE, _SAMPLES_PER_PIXEL))
+    if image.ndim == 2 and channels > 1 and bits > 8:
+        raise InputError(
+            f"{path}: has grey values of {bits} bits and an alpha or another channel beside them, of which not all "
+            "bits can be read. Save it without that channel."
+        )
+    if image.dtype != np.uint8 and _tiff_tag(content, _PHOTOMETRIC_INTERPRETATION) == 0:
+        raise InputError(f"{path}: says that 0 is white (WhiteIsZero). Save it with 0 as black (BlackIsZero).")
+
+
+def _tiff_tag(tiff: bytes, wanted: int) -> int | None:
+    """The first value of a tag of short numbers, or None.
 
     The first directory is looked through by itself, as Pillow does not open all kinds of numbers (TIFF 6.0, section 2).
     """
@@ -97,10 +113,15 @@ def _white_is_zero(tiff: bytes) -> bool:
     with suppress(struct.error):
         if order is not None and tiff[2:4] in (b"*\0", b"\0*"):
             (place,) = struct.unpack_from(f"{order}I", tiff, 4)
-            (count,) = struct.unpack_from(f"{order}H", tiff, place)
-            entries = (struct.unpack_from(f"{order}HHIH", tiff, place + 2 + 12 * n) for n in range(count))
-            return any(tag == _PHOTOMETRIC_INTERPRETATION and value == 0 for tag, _, _, value in entries)
-    return False
+            (entries,) = struct.unpack_from(f"{order}H", tiff, place)
+            for start in range(place + 2, place + 2 + 12 * entries, 12):
+                tag, _, count, value = struct.unpack_from(f"{order}HHIH", tiff, start)
+                if tag == wanted and count > 2:  # more than the entry has room for: they stand elsewhere
+                    (elsewhere,) = struct.unpack_from(f"{order}I", tiff, start + 8)
+                    (value,) = struct.unpack_from(f"{order}H", tiff, elsewhere)
+                if tag == wanted:
+                    return int(value)
+    return None
 
 
 def _is_shown_turned(picture: bytes) -> bool:

@@ -211,6 +211,24 @@ def test_other_tiffs_that_say_that_0_is_white_are_refused(tmp_path: Path, dtype:
         read_image(tmp_path / "miniswhite.tif")
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("channels", [2, 3])
+def test_a_tiff_of_16_bits_with_channels_beside_the_grey_one_is_refused(
+    tmp_path: Path, order: str, channels: int
+) -> None:
+    """OpenCV gives 12 bits in 16 as values from 0 to 15, or mixes the channels; of 8 bits none are lost."""
+    for dtype in (np.uint8, np.uint16):
+        grey = PIXELS.astype(dtype)
+        pixels = np.stack([grey, *[np.full_like(grey, np.iinfo(dtype).max)] * (channels - 1)], -1)
+        extra = ["unassalpha", "unspecified"][: channels - 1]
+        tifffile.imwrite(
+            tmp_path / f"{dtype.__name__}.tif", pixels, photometric="minisblack", extrasamples=extra, byteorder=order
+        )
+    np.testing.assert_array_equal(read_image(tmp_path / "uint8.tif").numpy(), PIXELS.astype(np.uint8))
+    with pytest.raises(InputError, match=r"uint16\.tif: has grey values of 16 bits and an alpha or another"):
+        read_image(tmp_path / "uint16.tif")
+
+
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_a_picture_that_is_to_be_shown_turned_is_refused(tmp_path: Path, suffix: str) -> None:
     picture = Image.fromarray((PIXELS // 16).astype(np.uint8))
