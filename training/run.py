@@ -13,7 +13,6 @@ from lightning.pytorch.callbacks import (
     Callback,
     EarlyStopping,
     EMAWeightAveraging,
-    ModelCheckpoint,
     ProgressBar,
     RichProgressBar,
     TQDMProgressBar,
@@ -29,7 +28,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.files import clear_leftovers, temporary_file, write_json
 from models.weights import SHIPPED_WEIGHTS, Weights, save_weights
 from training.card import write_card
-from training.checkpoints import WholeCheckpoints, last_good_checkpoint, read_checkpoint
+from training.checkpoints import BestCheckpoint, WholeCheckpoints, last_good_checkpoint, read_checkpoint
 from training.cohort import render_cohort
 from training.curves import draw_curves
 from training.data import ViewData
@@ -106,7 +105,7 @@ def train_network(
     module = NetworkTraining(settings.network, settings.loss, optimisation)
     if start is not None and not resume:
         begin_with(start, module.network)
-    best = ModelCheckpoint(
+    best = BestCheckpoint(
         out / "checkpoints",
         "best",
         monitor=_MONITORED if cohort.validation else None,
