@@ -22,6 +22,7 @@ from rich.console import Console
 from torch import nn
 
 from femoreg_torch.anatomy import HIP
+from femoreg_torch.case import case_folder
 from femoreg_torch.detect import load_network
 from femoreg_torch.detect.grid import NETWORK_SIZE
 from femoreg_torch.errors import InputError
@@ -68,6 +69,7 @@ def train_network(
     false, or has none to resume, or if `start` does not fit.
     """
     console = Console()
+    cases = [case_folder(case) for case in cases]  # by their names patients are told apart, and looked up
     if any("\ud800" <= letter <= "\udfff" for letter in str(out)):  # how Python holds bytes that are no letters
         raise InputError(f"{out}: the name of this folder is not UTF-8, which logs need. Choose another one.")
     last = out / "checkpoints" / "last.ckpt"
