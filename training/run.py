@@ -143,7 +143,7 @@ def train_network(
         return out / SHIPPED_WEIGHTS
     draw_curves(out / _TENSORBOARD, out / "curves.png")
     weights = export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
-    write_card(out / "card.md", settings, cases, out / _TENSORBOARD)
+    write_card(out / "card.md", settings, cases, out / _TENSORBOARD, trainer.current_epoch)
     return weights
 
 
