@@ -25,15 +25,15 @@ _MEASURES = {  # logged at the end of each epoch, and their columns
 }
 
 
-def write_card(path: Path, settings: TrainingSettings, cases: Sequence[Path], events: Path) -> None:
-    """Write the page of a run: its length, its patients, and what was measured after each epoch.
+def write_card(path: Path, settings: TrainingSettings, cases: Sequence[Path], events: Path, epochs: int) -> None:
+    """Write the page of a run of so many epochs: its length, its patients, and what was measured after each epoch.
 
     `events` is its folder of TensorBoard events. Raises `InputError` for an `origin.json` of a case that is no object.
     """
     log = EventAccumulator(str(events), size_guidance={"scalars": 0})
     log.Reload()
     run = settings.run
-    parts = ["## The run", _length(log, run.optimisation), data_table(run.cohort, cases), _epochs(log)]
+    parts = ["## The run", _length(log, run.optimisation, epochs), data_table(run.cohort, cases), _epochs(log)]
     write_text(path, "\n\n".join(parts) + "\n")
 
 
@@ -66,13 +66,14 @@ def _origin(path: Path) -> tuple[str, str]:
     return licence, source
 
 
-def _length(log: EventAccumulator, optimisation: OptimisationSettings) -> str:
+def _length(log: EventAccumulator, optimisation: OptimisationSettings, epochs: int) -> str:
     logged = _scalars(log, "train/loss")
-    steps = optimisation.epochs * optimisation.batches_per_epoch
+    steps, planned = (n * optimisation.batches_per_epoch for n in (epochs, optimisation.epochs))
+    early = f", of {planned} steps that were planned" if steps < planned else ""
     pauses = [after.wall_time - before.wall_time for before, after in pairwise(logged)]
     hours = sum(seconds for seconds in pauses if seconds < _PAUSE_S) / 3600
     return (
-        f"{steps} steps of {optimisation.batch_size} images ({steps * optimisation.batch_size} images), "
+        f"{steps} steps of {optimisation.batch_size} images ({steps * optimisation.batch_size} images){early}, "
         f"{hours:.1f} hours without pauses, torch {torch.__version__}."
     )
 

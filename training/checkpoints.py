@@ -1,4 +1,7 @@
-"""Checkpoints that are written whole, and of a run that is resumed, the newest that is whole and fits the network."""
+"""Checkpoints that are written whole, and of a run that is resumed, the newest that is whole and fits the network.
+
+The best one stays known where the folder of the run was moved.
+"""
 
 import io
 from collections.abc import Callable
@@ -6,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import nn
 
@@ -14,6 +18,8 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 
 _STATE = ("epoch", "loops", "optimizer_states", "lr_schedulers")  # what Lightning goes on from, beside the weights
+
+_PATHS = ("best_model_path", "kth_best_model_path", "last_model_path")  # in the state of `BestCheckpoint`
 
 
 class WholeCheckpoints(TorchCheckpointIO):
@@ -31,6 +37,31 @@ class WholeCheckpoints(TorchCheckpointIO):
         file.parent.mkdir(parents=True, exist_ok=True)
         with temporary_file(file) as part:
             part.write_bytes(content.getbuffer())
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """Lightning's, which forgets what was best so far where the folder of a run was moved or copied.
+
+    The first epoch after that would count as the best one, and be exported.
+    """
+
+    @property
+    def state_key(self) -> str:
+        """That of Lightning's own, by which runs of versions before this class know it."""
+        return super().state_key.replace(type(self).__qualname__, ModelCheckpoint.__qualname__, 1)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take over the state of the run, with the names that its files have now."""
+        folder = Path(str(self.dirpath))
+
+        def here(path: str) -> str:
+            return str(folder / Path(path).name) if path else path
+
+        if state_dict["best_model_path"] and Path(here(state_dict["best_model_path"])).is_file():
+            paths = {name: here(state_dict[name]) for name in _PATHS}
+            models = {here(path): score for path, score in state_dict["best_k_models"].items()}
+            state_dict = {**state_dict, **paths, "best_k_models": models, "dirpath": self.dirpath}
+        super().load_state_dict(state_dict)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from femoreg_torch.case import case_folder
 from femoreg_torch.detect import network_camera
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import clear_leftovers
@@ -85,11 +86,17 @@ def render_cohort(
 ) -> Cohort:
     """The views to train on and to validate on, rendered into `cache` unless they are there.
 
-    `cases` are folders as `sim.labelled.patient_folders` reads them; those whose files have changed since are rendered
-    anew, and so are procedural patients whose CT has another voxel size. Raises `InputError` if two cases have one
-    name, or the cache holds views made with other settings.
+    `cases` are folders as `sim.labelled.patient_folders` reads them, or their `case.yaml`; those whose files have
+    changed since are rendered anew, and so are procedural patients whose CT has another voxel size. Raises `InputError`
+    if two cases have one name, there is no patient to learn from, or the cache holds views made with other settings.
     """
+    cases = [case_folder(case) for case in cases]
     _check_names(cases)
+    if not cases and not settings.patient_seeds:
+        raise InputError(
+            "training: there is no patient to learn from. Give folders by --cases, or procedural patients by "
+            "cohort.patient_seeds in the settings."
+        )
     given = [_of_case(case, settings, report) for case in cases]  # complains before anything is rendered
     cache.mkdir(parents=True, exist_ok=True)
     clear_leftovers(cache)

@@ -4,7 +4,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
+from femoreg_torch.detect import image_from_network
+from femoreg_torch.detect.grid import NETWORK_SIZE
 from training.accuracy import COARSE
 from training.labelled import LabelledImage
 from training.measure import Reading
@@ -45,9 +48,15 @@ def cropped_to_one_hip(image: LabelledImage) -> LabelledImage:
     covered = (torch.arange(columns) < low) | (torch.arange(columns) >= low + keep)
     attenuation = image.attenuation.masked_fill(covered, image.attenuation.max().item())
     hidden = (image.landmarks[:, 0] < low) | (image.landmarks[:, 0] >= low + keep)
-    factor = columns // image.labels.shape[1]
-    labels = image.labels.masked_fill(covered[::factor], 0)
+    labels = image.labels.masked_fill(covered[_columns_of_labels(image).clamp(0, columns - 1)], 0)
     return replace(image, attenuation=attenuation, labels=labels, visible=image.visible & ~hidden)
+
+
+def _columns_of_labels(image: LabelledImage) -> Tensor:
+    """The image's column below each column of its labels (w,), which lie on the network's grid or on half of it."""
+    width = image.labels.shape[1]
+    columns = (torch.arange(width, dtype=torch.float64) + 0.5) * (NETWORK_SIZE / width) - 0.5
+    return image_from_network(torch.stack([columns, columns], -1), image.camera)[:, 0].round().long()
 
 
 ALTERATIONS: dict[str, Callable[[LabelledImage], LabelledImage]] = {

@@ -13,7 +13,6 @@ from lightning.pytorch.callbacks import (
     Callback,
     EarlyStopping,
     EMAWeightAveraging,
-    ModelCheckpoint,
     ProgressBar,
     RichProgressBar,
     TQDMProgressBar,
@@ -23,13 +22,14 @@ from rich.console import Console
 from torch import nn
 
 from femoreg_torch.anatomy import HIP
+from femoreg_torch.case import case_folder
 from femoreg_torch.detect import load_network
 from femoreg_torch.detect.grid import NETWORK_SIZE
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import clear_leftovers, temporary_file, write_json
 from models.weights import SHIPPED_WEIGHTS, Weights, save_weights
 from training.card import write_card
-from training.checkpoints import WholeCheckpoints, last_good_checkpoint, read_checkpoint
+from training.checkpoints import BestCheckpoint, WholeCheckpoints, last_good_checkpoint, read_checkpoint
 from training.cohort import render_cohort
 from training.curves import draw_curves
 from training.data import ViewData
@@ -69,6 +69,7 @@ def train_network(
     false, or has none to resume, or if `start` does not fit.
     """
     console = Console()
+    cases = [case_folder(case) for case in cases]  # by their names patients are told apart, and looked up
     if any("\ud800" <= letter <= "\udfff" for letter in str(out)):  # how Python holds bytes that are no letters
         raise InputError(f"{out}: the name of this folder is not UTF-8, which logs need. Choose another one.")
     last = out / "checkpoints" / "last.ckpt"
@@ -106,7 +107,7 @@ def train_network(
     module = NetworkTraining(settings.network, settings.loss, optimisation)
     if start is not None and not resume:
         begin_with(start, module.network)
-    best = ModelCheckpoint(
+    best = BestCheckpoint(
         out / "checkpoints",
         "best",
         monitor=_MONITORED if cohort.validation else None,
@@ -142,7 +143,7 @@ def train_network(
         return out / SHIPPED_WEIGHTS
     draw_curves(out / _TENSORBOARD, out / "curves.png")
     weights = export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
-    write_card(out / "card.md", settings, cases, out / _TENSORBOARD)
+    write_card(out / "card.md", settings, cases, out / _TENSORBOARD, trainer.current_epoch)
     return weights
 
 

@@ -44,6 +44,7 @@ from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM, model_attenuation
 from femoreg_torch.volume import is_in_ras, read_ct_told, read_landmarks
 from femoreg_torch.volume.borders import cut_bones
+from femoreg_torch.volume.round_field import round_field
 
 _ANY_PATH = PlannedPath(FEMUR, torch.zeros(3).double(), torch.ones(3).double())
 _ANY_POINTS = {name: n * torch.ones(3).double() for n, name in enumerate(DEVICE_POINTS)}
@@ -115,9 +116,9 @@ def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAn
         if seen.bones is not None:
             for bone in (PELVIS, operated_femur(side)):
                 found.attempt(lambda bone=bone: seen.bones.of((bone,), HIP))  # type: ignore[misc]
-            found.warnings += cut_bones(
-                seen.bones.labels, seen.bones.ids, ("hip_left", "hip_right", operated_femur(side))
-            )
+            cut = ("hip_left", "hip_right", operated_femur(side))
+            circle = None if seen.ct is None else round_field(seen.ct)
+            found.warnings += cut_bones(seen.bones.labels, seen.bones.ids, cut, circle)
             check_head(side, seen, found)
         if path is not None:
             check_path(path, side, seen, found)

@@ -16,6 +16,7 @@ from femoreg_torch.segment.refine import closed_joint_mm2, refined_labels, unref
 from femoreg_torch.segment.without_network import bones_without_network
 from femoreg_torch.volume import Volume, resample_isotropic
 from femoreg_torch.volume.borders import cut_bones
+from femoreg_torch.volume.round_field import round_field
 
 _BONE_HU, _METAL_HU = 200.0, 2800.0
 _LEAST_HIP_ML = 15.0  # of a hip bone; whole ones of adults have 180 to 400
@@ -185,7 +186,7 @@ def _warnings(
 ) -> list[str]:
     names = anatomy.bone_names
     ids = {name: 1 + names.index(name) for name in volume_ml}
-    told = cut_bones(labels, ids, list(ids))
+    told = cut_bones(labels, ids, list(ids), round_field(ct))
     if len(hips) == 1:
         other = "right" if hips == ["left"] else "left"
         told.append(f"the {other} hip bone is not in the CT: one half of the pelvis is missing")

@@ -13,8 +13,9 @@ from femoreg_torch.segment.heads import DOUBTED_RESIDUAL_MM, HEAD_RADIUS_MM, dou
 from femoreg_torch.segment.rules import SIDES, find_surface_landmarks
 from femoreg_torch.segment.surface import STEP_MM, bone_surface
 from femoreg_torch.volume import BoneLabels, Volume
+from femoreg_torch.volume.round_field import RoundField, round_field
 
-_BORDER_MM = 4.0  # a point so near to the CT's border may be where the CT ends and no landmark
+_BORDER_MM = 4.0  # a point so near to the CT's border, or its round field's, may be where the CT ends and no landmark
 _LEAST_ML = 15.0  # of a hip bone or femur that is looked at
 
 
@@ -47,11 +48,14 @@ def propose_landmarks(ct: Volume, bones: BoneLabels) -> Proposal:
     points = {name: torch.from_numpy(np.asarray(point, np.float64)) for name, point in found.points.items()}
     left_out: dict[str, str] = {}
     warnings: list[str] = []
+    field = round_field(ct)
     for name in HIP.landmark_names:
         if name not in points:
             left_out[name] = "its bone, or what is needed of it, is not in the label map"
         elif not _well_inside(points[name], ct):
             left_out[name] = "lies at the border of the CT"
+        elif field is not None and _within_mm(points[name], ct, field) < _BORDER_MM:
+            left_out[name] = "lies at the edge of the round field of the CT"
     for side, radius in found.head_radius.items():
         name, residual = f"FH-{side[0]}", found.head_residual[side]
         if not HEAD_RADIUS_MM[0] <= radius <= HEAD_RADIUS_MM[1]:
@@ -71,9 +75,21 @@ def propose_landmarks(ct: Volume, bones: BoneLabels) -> Proposal:
 
 
 def _well_inside(point: Tensor, ct: Volume) -> bool:
-    index = torch.linalg.inv(ct.lps_from_index) @ torch.cat([point, torch.ones(1, dtype=torch.float64)])
     room = [_BORDER_MM / s for s in ct.spacing_mm]
-    return all(r <= float(i) <= n - 1 - r for i, n, r in zip(index[:3], ct.data.shape[::-1], room, strict=True))
+    return all(r <= i <= n - 1 - r for i, n, r in zip(_index(point, ct), ct.data.shape[::-1], room, strict=True))
+
+
+def _within_mm(point: Tensor, ct: Volume, field: RoundField) -> float:
+    x, y, _ = _index(point, ct)
+    return float(field.within_mm(torch.tensor(x * ct.spacing_mm[0]), torch.tensor(y * ct.spacing_mm[1])))
+
+
+def _index(point: Tensor, ct: Volume) -> list[float]:
+    """x, y and z of a point (3,), LPS mm, in voxels."""
+    index: list[float] = (
+        torch.linalg.inv(ct.lps_from_index) @ torch.cat([point, torch.ones(1, dtype=torch.float64)])
+    ).tolist()
+    return index[:3]
 
 
 def _expected_error(spread_mm: float, spacing_mm: tuple[float, float, float], residual_mm: float) -> float:

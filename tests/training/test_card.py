@@ -43,7 +43,10 @@ def test_pauses_do_not_count_and_every_epoch_has_its_row(tmp_path: Path) -> None
         events.add_scalar("validation/visibility", 0.5, step)
     events.close()
     settings = read_settings("quick")
-    write_card(tmp_path / "card.md", settings, [], tmp_path / "events")
+    write_card(tmp_path / "card.md", settings, [], tmp_path / "events", settings.run.optimisation.epochs)
     page = (tmp_path / "card.md").read_text(encoding="utf-8")
     assert "240 steps of 8 images (1920 images), 0.3 hours without pauses" in page
     assert "| 2 | 0.900 | 0.500 |\n| 4 | 0.700 | 0.500 |" in page
+    write_card(tmp_path / "card.md", settings, [], tmp_path / "events", 2)  # stopped early
+    page = (tmp_path / "card.md").read_text(encoding="utf-8")
+    assert "80 steps of 8 images (640 images), of 240 steps that were planned, 0.3 hours" in page

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
 
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 from models.unet import UNetSettings
 from models.weights import Weights, save_weights
-from training.checkpoints import last_good_checkpoint, read_checkpoint
+from training.checkpoints import BestCheckpoint, last_good_checkpoint, read_checkpoint
 from training.module import NetworkTraining
 from training.run import Machine, train_network
 from training.settings import TrainingSettings, read_settings
@@ -49,6 +50,28 @@ def test_a_truncated_checkpoint_is_told_and_passed_over(tmp_path: Path) -> None:
     best.write_bytes(b"")
     with pytest.raises(InputError, match="holds no whole checkpoint"):
         last_good_checkpoint(tmp_path, module, told.append)
+
+
+def best_of(folder: Path, kind: type[ModelCheckpoint] = BestCheckpoint) -> ModelCheckpoint:
+    return kind(folder, "best", monitor="loss", save_last=True, enable_version_counter=False)
+
+
+def test_what_was_best_stays_known_where_the_run_was_moved(tmp_path: Path) -> None:
+    old, new = tmp_path / "old" / "checkpoints", tmp_path / "new" / "checkpoints"
+    before = best_of(old, ModelCheckpoint)  # also of a run of Lightning's own
+    before.best_model_path, before.kth_best_model_path = str(old / "best.ckpt"), str(old / "best.ckpt")
+    before.last_model_path = str(old / "last.ckpt")
+    before.best_model_score = before.kth_value = torch.tensor(3.8)
+    before.best_k_models = {before.best_model_path: before.best_model_score}
+    new.mkdir(parents=True)
+    (new / "best.ckpt").touch()
+    after = best_of(new)
+    assert after.state_key == before.state_key
+    after.load_state_dict(before.state_dict())
+    assert after.best_model_path == str(new / "best.ckpt")
+    assert list(after.best_k_models) == [after.best_model_path]
+    assert after.kth_best_model_path == after.best_model_path
+    assert after.best_model_score == torch.tensor(3.8)
 
 
 def test_weights_without_the_state_of_a_run_are_passed_over(tmp_path: Path) -> None:

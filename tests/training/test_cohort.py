@@ -1,5 +1,6 @@
 """Who is rendered into the cache: patients of one's own by their tables, told apart by name, anew when they change."""
 
+import json
 import os
 import shutil
 from dataclasses import replace
@@ -20,6 +21,13 @@ from training.cohort import CohortSettings, render_cohort
 
 SETTINGS = CohortSettings(patient_seeds=[], validation_seeds=[], case_variants=2, patient_variants=1, views=1)
 TABLE = "totalsegmentator_v2"
+TINY = """
+cohort: {patient_seeds: [], validation_seeds: [], case_variants: 2, patient_variants: 1, views: 1}
+network: {kind: multitask_unet, channels: [4, 8], convolutions: [1, 1]}
+loss: {kind: multitask}
+optimisation: {epochs: 1, batches_per_epoch: 1, batch_size: 1}
+workers: 0
+"""
 
 
 def in_another_table(case: Path, folder: Path) -> Path:
@@ -80,6 +88,26 @@ def test_two_folders_of_one_name(case: Path, tmp_path: Path, capsys: pytest.Capt
     assert not out.exists()
     with pytest.raises(InputError, match="or give it once"):
         rendered([one, one], tmp_path / "cache")
+
+
+def test_cases_given_by_their_case_yaml_are_told_apart_by_their_folders(case: Path, tmp_path: Path) -> None:
+    one, other = (in_another_table(case, tmp_path / name) for name in ("one", "other"))
+    files, _ = rendered([one / "case.yaml", other / "case.yaml"], tmp_path / "cache")
+    assert [file.name for file in files[::2]] == ["case_one_00.safetensors", "case_other_00.safetensors"]
+    assert rendered([one], tmp_path / "cache") == (files[:2], [])
+    (one / "origin.json").write_text('{"licence": "zlib", "source": "a scan"}', encoding="utf-8")
+    (tmp_path / "tiny.yaml").write_text(TINY, encoding="utf-8")
+    cache = str(tmp_path / "cache")
+    command = ["train", str(tmp_path / "tiny.yaml"), "--cases", f"[{one / 'case.yaml'}]", "--cache", cache]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    assert "| one | 2 | 2 | zlib | a scan |" in (tmp_path / "out" / "card.md").read_text(encoding="utf-8")
+    assert json.loads((tmp_path / "out" / "settings.json").read_text(encoding="utf-8"))["cases"] == ["one"]
+
+
+def test_nobody_to_learn_from_is_told_before_anything_is_rendered(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no patient to learn from"):
+        rendered([], tmp_path / "cache", replace(SETTINGS, validation_seeds=[101]))
+    assert not (tmp_path / "cache").exists()
 
 
 def test_a_folder_that_does_not_fit_is_told_before_anything_is_rendered(case: Path, tmp_path: Path) -> None:

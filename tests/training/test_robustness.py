@@ -1,12 +1,15 @@
 """Altered images: truth and image stay together; start poses are counted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
 from femoreg_torch.anatomy import HIP
-from femoreg_torch.geometry import load_carm, project_points, transform_points
+from femoreg_torch.detect import image_from_network
+from femoreg_torch.geometry import centred_camera, load_carm, project_points, transform_points
 from training.labelled import LabelledImage
 from training.measure import Reading
 from training.robustness import Outcomes, cropped_to_one_hip, inverted, outcomes, turned
@@ -51,6 +54,19 @@ def test_a_crop_keeps_the_fuller_side_and_hides_the_rest(image: LabelledImage) -
     assert (other.attenuation[:, :80] == 4).all()
     assert other.attenuation[:, 100:].equal(image.attenuation[:, 100:])
     assert not other.labels[:, :60].any()
+
+
+@pytest.mark.parametrize(("size", "pixel_mm"), [(180, 1.552), (1436, 0.194), (384, 0.776), (128, 3.2)])
+def test_a_crop_of_an_image_of_any_size(image: LabelledImage, size: int, pixel_mm: float) -> None:
+    """Those of the DeepFluoro data set have 180 and 1436 columns, and their labels 192."""
+    camera = centred_camera(1020.0, (pixel_mm, pixel_mm), (size, size))
+    pixels = project_points(camera, transform_points(TRUTH, POINTS))
+    shown = torch.linspace(1, 4, size).expand(size, size)
+    labels = torch.full((192, 192), VERTEBRAE, dtype=torch.uint8)
+    other = cropped_to_one_hip(replace(image, attenuation=shown, camera=camera, landmarks=pixels, labels=labels))
+    first = int(other.labels[0].nonzero()[0])
+    low = image_from_network(torch.tensor([first - 0.5, 0.0]).double(), camera)[0].item()
+    assert low == pytest.approx(size - round(0.55 * size) - 0.5, abs=0.6 * size / 179)
 
 
 def test_start_poses_are_good_refused_or_silent_failures() -> None:
