@@ -14,11 +14,12 @@ from femoreg_torch.beads.given import COLUMNS
 from femoreg_torch.beads.measure import Measured
 from femoreg_torch.beads.uncertainty import metric_deviations, object_rows, pose_uncertainty, view_rows
 from femoreg_torch.case import Case, View, write_case
+from femoreg_torch.case.model import Intensity
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import ReferencePoints, reference_points
 from femoreg_torch.evaluation.overlay import monitor_picture
 from femoreg_torch.files import new_folder, temporary_file, write_json
-from femoreg_torch.fluoro import read_image, write_image
+from femoreg_torch.fluoro import StoredImage, read_stored, settled_intensity, write_image
 from femoreg_torch.geometry import Camera
 from femoreg_torch.pictures import write_picture
 from femoreg_torch.volume import read_ct, write_volume
@@ -28,6 +29,8 @@ CT_NAME = "ct.nii.gz"
 _VERSION = 1
 _PANEL_PX = 768  # of one image in the picture
 _YELLOW, _RED = (0, 220, 255), (60, 60, 255)  # blue, green, red
+_MOST_GREY = 65535  # of 16 bits
+_LEAST_GREYS = 200  # that fractions span, so that rounded ones are as fine as a picture of 8 bits
 
 
 def bead_points(case: Case, names: tuple[str, ...]) -> ReferencePoints:
@@ -110,13 +113,30 @@ def _clean_view(folder: Path, out: Path, case: Case, found: Measured, number: in
     view, images = case.views[number], {}
     for kind, path in view.images.items():
         centres, radii = _shadows(case, found, number, kind)
-        image = image_without(read_image(path, view.frames), centres, radii, case.carm.camera)
-        if view.intensity == "log" or image.min() < 0 or image.max() > 65535:
-            raise InputError(f"{path}: raw images of 16 bits are written without beads; this one is none.")
+        stored = read_stored(path, view.frames)
+        _check_raw_16_bits(stored, settled_intensity(view.intensity, stored, str(path)), path)
+        # what is filled in may lie beyond what is around it
+        image = image_without(stored.values, centres, radii, case.carm.camera).clamp(0, _MOST_GREY)
         name = f"view{number + 1}_{kind}.tif"
         write_image(folder / name, image.round().to(torch.uint16))
         images[kind] = out / name
     return replace(view, images=images, frames=None)
+
+
+def _check_raw_16_bits(image: StoredImage, intensity: Intensity, path: Path) -> None:
+    """Raises `InputError` for an image that would be another one as raw intensities in whole numbers of 16 bits."""
+    if intensity == "log":
+        raise InputError(
+            f"{path}: holds logarithms, but images are written without beads as raw intensities of 16 bits. Give the "
+            "raw images."
+        )
+    low, high = (value.item() for value in image.values.aminmax())
+    fractions = bool((image.values != image.values.round()).any()) and high - low < _LEAST_GREYS
+    if fractions or low < 0 or high > _MOST_GREY:
+        raise InputError(
+            f"{path}: holds values from {low:g} to {high:g}, but images are written without beads as whole numbers "
+            f"from 0 to {_MOST_GREY}. Bring them there by a factor, which changes nothing else of raw images."
+        )
 
 
 def _shadows(case: Case, found: Measured, number: int, kind: str) -> tuple[Tensor, Tensor]:

@@ -7,10 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pydicom
 import pytest
+import SimpleITK as sitk
 import torch
 import trimesh
 import yaml
+from pydicom.dataset import FileDataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
 
 from femoreg_torch.beads import find_spots, read_trials
 from femoreg_torch.case import ObjectQuality, Result, read_case, result_content, write_json
@@ -193,6 +197,47 @@ def test_bad_input_ends_with_one_line(
     assert told in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"), [("fractions", "holds values from 0.0"), ("logarithms of a DICOM file", "holds logarithms")]
+)
+def test_images_that_would_be_others_in_whole_numbers_are_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: str, told: str
+) -> None:
+    content = yaml.safe_load((folder / "case.yaml").read_text(encoding="utf-8"))
+    for view in content["views"]:
+        for kind, name in view["images"].items():
+            counts = read_image(folder / name)
+            if change == "fractions":  # of the open beam
+                view["intensity"] = "raw"
+                sitk.WriteImage(sitk.GetImageFromArray((counts / 40_000).numpy()), str(folder / name))
+            else:  # of which the case says nothing
+                view["images"][kind] = f"{Path(name).stem}.dcm"
+                _write_logarithms(folder / view["images"][kind], (4000 * (counts / 65535).log()).numpy())
+    (folder / "case.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    out = tmp_path / "out"
+    assert main(["beads", str(folder), "--beads", str(folder / "beads.yaml"), "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert not out.exists()
+
+
+def _write_logarithms(path: Path, logarithms: np.ndarray) -> None:
+    """A DICOM file whose header says that its pixels are logarithms, larger ones of more light."""
+    pixels = np.round(logarithms - logarithms.min()).astype(np.uint16)
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = XRayAngiographicImageStorage, "1.2.3"
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    dataset = FileDataset(str(path), {}, file_meta=meta, preamble=b"\0" * 128)
+    dataset.SOPClassUID, dataset.SOPInstanceUID = XRayAngiographicImageStorage, "1.2.3"
+    dataset.Modality, dataset.PhotometricInterpretation, dataset.SamplesPerPixel = "XA", "MONOCHROME2", 1
+    dataset.Rows, dataset.Columns = pixels.shape
+    dataset.BitsAllocated, dataset.BitsStored, dataset.HighBit, dataset.PixelRepresentation = 16, 16, 15, 0
+    dataset.PixelIntensityRelationship, dataset.PixelIntensityRelationshipSign = "LOG", 1
+    dataset.PixelData = pixels.tobytes()
+    pydicom.dcmwrite(path, dataset)
 
 
 def test_the_case_itself_is_not_written_and_is_told_before_it_is_read(
