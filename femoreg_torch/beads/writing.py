@@ -184,8 +184,7 @@ def _draw(panel: np.ndarray, case: Case, found: Measured, number: int, kind: str
     for (column, row), radius in zip(centres.tolist(), radii.tolist(), strict=True):
         middle = (round(column / factor), round(row / factor))
         cv2.circle(panel, middle, round(radius / factor) + 4, _YELLOW, 1, cv2.LINE_AA)
-    name = case.views[number].images[kind].name
     for sight, used in zip(found.bundle.sights, found.bundle.used, strict=True):
-        if sight.image == name and not used:
+        if (sight.view, sight.kind) == (number, kind) and not used:
             middle = (round(sight.pixel[0] / factor), round(sight.pixel[1] / factor))
             cv2.drawMarker(panel, middle, _RED, cv2.MARKER_TILTED_CROSS, 12, 1, cv2.LINE_AA)
