@@ -50,6 +50,7 @@ class Sight:
     image: str  # its file, for the reader
     pixel: tuple[float, float]  # column, row
     spread: float = 1.0  # its deviation, in those of a shadow that nothing disturbs
+    kind: str | None = None  # of the image: files of two kinds may have one name, each in a folder of its own
 
 
 @dataclass(frozen=True, eq=False)

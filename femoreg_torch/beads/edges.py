@@ -75,9 +75,10 @@ def beside_metal(
     known = {thing.object: thing for thing in beads}
     fits = []
     for sight in sights:
-        kind = next(k for k, path in case.views[sight.view].images.items() if path.name == sight.image)
+        kind = sight.kind
+        assert kind is not None  # of a shadow that was seen in an image of the case
         image = images[kind][sight.view]
-        assert image is not None  # a shadow was seen there
+        assert image is not None
         there = [
             surfaces.moved(poses.camera_from(name)[sight.view].numpy())
             for name, surfaces in metal.items()

@@ -122,7 +122,7 @@ class _Matcher:
             for bead, spot in enumerate(match.spots.tolist()):
                 if spot >= 0:
                     column, row = pixels[spot].tolist()
-                    self.sights.append(Sight(thing.object, bead, view, name, (column, row)))
+                    self.sights.append(Sight(thing.object, bead, view, name, (column, row), kind=kind))
         if pose is not None:
             self._learn(thing, view, pose)
         elif view == 0:

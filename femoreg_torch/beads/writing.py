@@ -14,11 +14,12 @@ from femoreg_torch.beads.given import COLUMNS
 from femoreg_torch.beads.measure import Measured
 from femoreg_torch.beads.uncertainty import metric_deviations, object_rows, pose_uncertainty, view_rows
 from femoreg_torch.case import Case, View, write_case
+from femoreg_torch.case.model import Intensity
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import ReferencePoints, reference_points
 from femoreg_torch.evaluation.overlay import monitor_picture
 from femoreg_torch.files import new_folder, temporary_file, write_json
-from femoreg_torch.fluoro import read_stored, settled_intensity, write_image
+from femoreg_torch.fluoro import StoredImage, read_stored, settled_intensity, write_image
 from femoreg_torch.geometry import Camera
 from femoreg_torch.pictures import write_picture
 from femoreg_torch.volume import read_ct, write_volume
@@ -26,9 +27,9 @@ from femoreg_torch.volume import read_ct, write_volume
 UNCERTAINTY_NAME, BEADS_NAME, PICTURE_NAME = "truth_uncertainty.json", "beads.csv", "beads.png"
 CT_NAME = "ct.nii.gz"
 _VERSION = 1
-_WHITE = 65535  # of 16 bits
 _PANEL_PX = 768  # of one image in the picture
 _YELLOW, _RED = (0, 220, 255), (60, 60, 255)  # blue, green, red
+_MOST_GREY = 65535  # of 16 bits
 
 
 def bead_points(case: Case, names: tuple[str, ...]) -> ReferencePoints:
@@ -112,16 +113,29 @@ def _clean_view(folder: Path, out: Path, case: Case, found: Measured, number: in
     for kind, path in view.images.items():
         centres, radii = _shadows(case, found, number, kind)
         stored = read_stored(path, view.frames)
+        _check_raw_16_bits(stored, settled_intensity(view.intensity, stored, str(path)), path)
         image = image_without(stored.values, centres, radii, case.carm.camera)
-        settled = settled_intensity(view.intensity, stored, str(path))
-        if settled == "log" or image.min() < 0 or image.max() > _WHITE:
-            raise InputError(f"{path}: raw images of 16 bits are written without beads; this one is none.")
         if (stored.values != stored.values.round()).any():  # any scale will do, and rounding is not to be seen
-            image = image * (_WHITE / image.max())
+            image = image * (_MOST_GREY / image.max())
+        image = image.clamp(0, _MOST_GREY)  # what is filled in may lie beyond what is around it
         name = f"view{number + 1}_{kind}.tif"
         write_image(folder / name, image.round().to(torch.uint16))
         images[kind] = out / name
     return replace(view, images=images, frames=None)
+
+
+def _check_raw_16_bits(image: StoredImage, intensity: Intensity, path: Path) -> None:
+    """Raises `InputError` for an image that would be another one as raw intensities of 16 bits."""
+    if intensity == "log":
+        raise InputError(
+            f"{path}: holds logarithms, but raw images of 16 bits are written without beads. Give the raw images."
+        )
+    low, high = (value.item() for value in image.values.aminmax())
+    if low < 0 or high > _MOST_GREY:
+        raise InputError(
+            f"{path}: holds values from {low:g} to {high:g}, but raw images of 16 bits are written without beads. Bring "
+            f"its values to 0 to {_MOST_GREY} by a factor, which changes nothing else of raw images."
+        )
 
 
 def _shadows(case: Case, found: Measured, number: int, kind: str) -> tuple[Tensor, Tensor]:
@@ -169,8 +183,7 @@ def _draw(panel: np.ndarray, case: Case, found: Measured, number: int, kind: str
     for (column, row), radius in zip(centres.tolist(), radii.tolist(), strict=True):
         middle = (round(column / factor), round(row / factor))
         cv2.circle(panel, middle, round(radius / factor) + 4, _YELLOW, 1, cv2.LINE_AA)
-    name = case.views[number].images[kind].name
     for sight, used in zip(found.bundle.sights, found.bundle.used, strict=True):
-        if sight.image == name and not used:
+        if (sight.view, sight.kind) == (number, kind) and not used:
             middle = (round(sight.pixel[0] / factor), round(sight.pixel[1] / factor))
             cv2.drawMarker(panel, middle, _RED, cv2.MARKER_TILTED_CROSS, 12, 1, cv2.LINE_AA)

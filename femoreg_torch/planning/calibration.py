@@ -17,6 +17,7 @@ _ASH = {"ha": (0.887, 63.3), "k2hpo4": (1.06, 38.9)}
 _WINDOWS_HU = {"air": (-1024, -900), "fat": (-150, -50), "muscle": (20, 90)}  # where the peaks of a CT lie
 _LEAST_SHARE = 0.002  # of the voxels, in a window: less is no tissue but the rim of another
 _RIM_HU = 3  # a peak so close to the rim of its window is the slope of another
+_PADDING_HU = -1024  # the least value of 12 bits: what lies beyond a scanner's round field of view
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,15 @@ def _line(pairs: list[tuple[float, float]]) -> tuple[float, float]:
 
 
 def _peak(hu: NDArray[np.float32], tissue: str) -> float:
-    """The most frequent HU of a tissue, of a histogram smoothed by 3 HU."""
+    """The most frequent HU of a tissue, of a histogram smoothed by 3 HU.
+
+    Padding is no air, where there is other air: of a CT that has it in its corners bone was 2.4 % less dense.
+    """
     low, high = _WINDOWS_HU[tissue]
     counts = np.histogram(hu, bins=np.arange(low - 10, high + 12) - 0.5)[0].astype(float)
     inside = slice(10, len(counts) - 10)
+    if tissue == "air" and counts[inside][_PADDING_HU - low + 1 :].sum() >= _LEAST_SHARE * hu.size:
+        counts[: 10 + _PADDING_HU - low + 1] = 0
     best = int(ndimage.gaussian_filter1d(counts, 3, mode="nearest")[inside].argmax())
     rim = min(best, high - low - best) < _RIM_HU and tissue != "air"
     if counts[inside].sum() < _LEAST_SHARE * hu.size or rim:

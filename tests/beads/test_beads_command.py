@@ -237,6 +237,20 @@ def test_bad_input_ends_with_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_images_of_two_kinds_may_have_one_name(folder: Path, tmp_path: Path) -> None:
+    """Each kind in a folder of its own; the tool's shadows are measured again beside its edges, where it is seen."""
+    content = yaml.safe_load((folder / "case.yaml").read_text(encoding="utf-8"))
+    for number, view in enumerate(content["views"], 1):
+        for kind, name in view["images"].items():
+            (folder / kind).mkdir(exist_ok=True)
+            (folder / name).rename(folder / kind / f"{number}.tif")
+            view["images"][kind] = f"{kind}/{number}.tif"
+    (folder / "case.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    out = tmp_path / "out"
+    assert main(["beads", str(folder), "--beads", str(folder / "beads.yaml"), "--out", str(out)]) == 0
+    assert read_json(out / "truth_uncertainty.json")["deviations"]["device"]["mm"] < 0.3  # 0.7 by the other images
+
+
 def test_the_case_itself_is_not_written_and_is_told_before_it_is_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -39,6 +39,16 @@ def test_air_fat_and_muscle_are_found_by_their_peaks(solids: Solids) -> None:
     np.testing.assert_allclose([found.slope, found.intercept], [0.000887 * slope, (0.887 * intercept + 63.3) / 1000])
 
 
+def test_padding_is_no_air_where_there_is_other_air(solids: Solids) -> None:
+    hu = (solids[0].data.numpy() + np.random.default_rng(0).normal(0, 8, solids[0].data.shape)).astype(np.float32)
+    settings = CalibrationSettings("internal", **RIGHT_KIND)
+    padded = hu.copy()
+    padded[:, :, :3] = -1024  # more of it at one value than of air at any
+    assert calibrate(padded, settings).references["air"][0] == pytest.approx(-1000, abs=3)
+    padded[hu < -900] = -1024  # a simulated CT, whose air is all of one value
+    assert calibrate(padded, settings).references["air"][0] == -1024
+
+
 def test_laws_at_densities_worked_out_by_hand(planning: Planning) -> None:
     keyak = bone_material(np.array([0.5]), planning.bone)
     np.testing.assert_allclose(keyak.modulus, 14900 * 0.27547628)  # 0.5 ** 1.86
