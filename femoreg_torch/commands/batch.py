@@ -213,8 +213,9 @@ def run_job(job: Job) -> Row:
     from femoreg_torch.commands.register import register_into
     from femoreg_torch.errors import InputError, defect_in_one_line
 
-    torch.set_num_threads(job.threads)
-    numba.set_num_threads(job.threads)  # or its kernels take all cores, and torch's next ones with them
+    threads = min(job.threads, numba.config.NUMBA_NUM_THREADS)  # the environment may allow fewer than there are cores
+    torch.set_num_threads(threads)
+    numba.set_num_threads(threads)  # or its kernels take all cores, and torch's next ones with them
     began = time.perf_counter()
     try:
         device = torch.device(job.device)

@@ -108,10 +108,7 @@ def some_of(names: list[str]) -> str:
 
 def check_landmarks(seen: SeenAnatomy, found: Found) -> None:
     if seen.landmarks and len(seen.landmarks) < MINIMUM:
-        found.warnings.append(
-            f"landmarks: {len(seen.landmarks)} of them; with fewer than {MINIMUM} the start pose hangs on the outlines "
-            f"of the bones. Place more of {', '.join(HIP.landmark_names)}."
-        )
+        found.warnings.append(f"landmarks: {len(seen.landmarks)} of them; {_of_few(seen)}.")
     outside = set()
     if seen.ct is not None:
         for name, point in seen.landmarks.items():
@@ -129,6 +126,19 @@ def check_landmarks(seen: SeenAnatomy, found: Found) -> None:
         found.warnings += landmarks_without_bones(seen.bones, inside, seen.anatomy)
         if not swapped:
             found.warnings += landmarks_beside_bones(seen.bones, inside, seen.anatomy)
+
+
+def _of_few(seen: SeenAnatomy) -> str:
+    """In words, what too few landmarks mean for the start, and which of the anatomy's could be placed too."""
+    outlined = seen.anatomy is not None and seen.anatomy.outline
+    means = (
+        f"with fewer than {MINIMUM} the start pose hangs on the outlines of the bones"
+        if outlined
+        else f"a start pose by landmarks needs {MINIMUM}"
+    )
+    names = [] if seen.anatomy is None else seen.anatomy.landmark_names
+    missing = [name for name in names if name not in seen.landmarks]
+    return f"{means}. Place more of {', '.join(missing)}" if missing else means
 
 
 def check_head(side: Side, seen: SeenAnatomy, found: Found) -> None:

@@ -100,12 +100,10 @@ def _folder(path: Path, series: str | None) -> Findings:
     if kind == "masks of bones":
         return _segmentation(path)
     if kind in ("several things", "images"):
-        entries = _entries(path)
-        facts = [_in_short(entry) for entry in entries[:_LISTED]]
-        if len(entries) > _LISTED:
-            facts.append(f"and {len(entries) - _LISTED} more")
-        return Findings(f"folder of {kind}", tuple(facts))
+        return _listed(path, kind)
     there = series_in(path)
+    if not there and any(entry.is_dir() for entry in _entries(path)):
+        return _listed(path, "several things")
     if not there:
         raise InputError(f"{path}: holds no case.yaml, no DICOM files, no images and no masks of bones.")
     facts = [one.told for one in there]
@@ -121,6 +119,14 @@ def _folder(path: Path, series: str | None) -> Findings:
     return Findings("DICOM folder", (*facts, *found.facts), found.warnings, found.picture)
 
 
+def _listed(folder: Path, kind: str) -> Findings:
+    entries = _entries(folder)
+    facts = [_in_short(entry) for entry in entries[:_LISTED]]
+    if len(entries) > _LISTED:
+        facts.append(f"and {len(entries) - _LISTED} more")
+    return Findings(f"folder of {kind}", tuple(facts))
+
+
 def _entries(folder: Path) -> list[Path]:
     return sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
 
@@ -132,11 +138,17 @@ def _kind_of(folder: Path) -> str:
     names = [entry.name.lower() for entry in _entries(folder)]
     if any(name.endswith(_ALONE) for name in names):
         return "several things"
-    if any(name.endswith(_VOLUMES) for name in names):
-        return "masks of bones"
+    if volumes := [name for name in names if name.endswith(_VOLUMES)]:
+        # a CT beside its label map is no folder of masks, and neither is called by a bone
+        return "masks of bones" if any(_named_after_a_bone(name) for name in volumes) else "several things"
     if names and all(name.endswith(_PICTURES) for name in names):
         return "images"
     return "DICOM files"
+
+
+def _named_after_a_bone(name: str) -> bool:
+    ending = max((suffix for suffix in _VOLUMES if name.endswith(suffix)), key=len)
+    return bone_of_name(HIP, name.removesuffix(ending)) is not None
 
 
 def _in_short(entry: Path) -> str:
@@ -144,7 +156,9 @@ def _in_short(entry: Path) -> str:
     if entry.is_dir():
         kind = _kind_of(entry)
         if kind == "DICOM files":
-            return f"{entry.name}: folder, {'; '.join(one.told for one in series_in(entry)) or 'nothing known here'}"
+            told = "; ".join(one.told for one in series_in(entry))
+            nothing = "more folders" if any(inner.is_dir() for inner in _entries(entry)) else "nothing known here"
+            return f"{entry.name}: folder, {told or nothing}"
         return f"{entry.name}: {'' if kind == 'case' else 'folder of '}{kind}"
     try:
         found = inspect_path(entry)

@@ -69,15 +69,17 @@ def guide(result: Result) -> Guidance:
 def untold_turn(result: Result, found: Guidance) -> str | None:
     """That no image tells the turn of a tool about its long axis, and what that leaves open, in words; or None.
 
-    It is round, or what is in view of it is.
+    It is round, or what is in view of it is. That what is told in the frame of the object holds all the same is said
+    of a result that is trusted, and of no other.
     """
     quality = result.quality.get(found.tool)
     if quality is None or quality.turn_told:
         return None
-    return (
+    untold = (
         f"no image tells the turn of the {found.tool} about its long axis: directions in its frame, or in the robot's "
-        f"base, may be turned about it; those in the frame of the {found.object} hold"
+        "base, may be turned about it"
     )
+    return f"{untold}; those in the frame of the {found.object} hold" if result.verdict.trusted else untold
 
 
 def _angle(a: Tensor, b: Tensor) -> float:

@@ -20,7 +20,8 @@ def navigation_content(result: Result, robot: Robot | None) -> dict[str, Any]:
 
     Keys are named after the object with the planned path and its tool: `femur_from_device`, `in_femur`, `in_device`.
     Of a round tool no image tells the turn about its own axis, so that no direction in its frame, or in the robot's
-    base, is known, and the content is not trusted. What is told in the frame of the object holds.
+    base, is known, and the content is not trusted. What is told in the frame of the object holds if the result is
+    trusted.
     Raises `InputError` if no tool was registered.
     """
     found = guide(result)

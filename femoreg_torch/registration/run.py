@@ -57,8 +57,7 @@ def network_detector(case: Case, weights: Path | None = None, device: torch.devi
     if case.anatomy is not None and case.anatomy.landmark_names != network.anatomy.landmark_names:
         raise InputError(
             f"{case.folder}/case.yaml, anatomy: the network knows landmarks of the {network.anatomy.name}, not those "
-            f"of the {case.anatomy.name}. Give the weights of another one (--weights), landmarks in the image "
-            "(--landmarks), or a start pose (--start)."
+            f"of the {case.anatomy.name}. Give landmarks in the image (--landmarks), or a start pose (--start)."
         )
     return lambda image, camera: detect(network, image, camera)
 

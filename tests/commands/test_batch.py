@@ -34,6 +34,17 @@ def test_a_killed_process_loses_its_own_case_alone() -> None:
     assert "killed" in rows["deadly"].reasons
 
 
+def test_fewer_threads_by_the_environment_than_cores_are_no_defect(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A queue that sets NUMBA_NUM_THREADS=1 on a machine of many cores: numba takes no larger number."""
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
+    job = Job(tmp_path / "none", tmp_path / "run", "fast", 0, None, 2)
+    ((_, row),) = run_jobs([job], 1)
+    assert row.status == "refused"
+    assert "none: no such folder" in row.reasons
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [(["--jobs", "0"], "--jobs: 1 to"), (["--preset", "quickest"], "derivative_free"), (["--jobs", "1"], "'case'")],

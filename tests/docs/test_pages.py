@@ -17,6 +17,7 @@ from femoreg_torch.commands.main import GROUP, parser_of
 from femoreg_torch.errors import InputError
 from femoreg_torch.registration import load_plan
 from femoreg_torch.text import yaml_content
+from models.kinds import LOSSES, NETWORKS
 
 SHELL, PYTHON = ("sh", "bash"), "python"
 LANGUAGES = (*SHELL, PYTHON, "yaml", "toml", "text", "json", "")
@@ -75,6 +76,13 @@ def test_yaml_on_the_pages_can_be_read() -> None:
             yaml_content(block.code, block.place)
         except InputError as error:
             pytest.fail(str(error))
+
+
+def test_kinds_on_the_page_of_settings_are_kinds() -> None:
+    """By its class or by its kind: a heading names what a preset has to say."""
+    page = (ROOT / "docs/reference/settings.md").read_text(encoding="utf-8")
+    headed = dict(re.findall(r"### Training: (?:network|loss) `(\w+)`\n\n```\{femoreg-keys\} [\w.]+:(\w+)", page))
+    assert headed == {kind: record.__name__ for kind, record in (NETWORKS | LOSSES).items()}
 
 
 @pytest.mark.parametrize("page", USUAL)

@@ -15,10 +15,13 @@ import torch
 import trimesh
 from intake_files import HEAD, case_content, landmarks, markups, ras_affine, write_content, write_files
 
+from femoreg_torch.anatomy import HIP, load_anatomy
 from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 from femoreg_torch.intake import check_case
+from femoreg_torch.intake.check_anatomy import SeenAnatomy, check_landmarks
+from femoreg_torch.intake.found import Found
 from femoreg_torch.intake.volumes import ct_warnings
 from femoreg_torch.registration import prepare_scene
 from femoreg_torch.volume import Volume, axis_aligned, read_ct, read_label_map
@@ -378,6 +381,29 @@ def test_few_landmarks_are_a_warning(files: Path, tmp_path: Path) -> None:
     checked = check_case(folder, find_start=False)
     assert sum("landmarks: 3 of them; with fewer than 4 the start" in warning for warning in checked.warnings) == 1
     assert checked.problems == ()
+
+
+def test_of_few_landmarks_those_of_the_cases_own_anatomy_are_named(tmp_path: Path) -> None:
+    """A knee has no femoral head to be placed, and its anatomy no outlines that a start could hang on."""
+    (tmp_path / "knee.yaml").write_text(
+        "bones: {femur: {mirror: femur, colour: [255, 60, 100], names: [distal femur]}}\n"
+        "groups: {}\n"
+        "landmarks:\n"
+        "  ME: {bone: femur, mirror: ME, spread_mm: 2.0, means: medial epicondyle}\n"
+        "  LE: {bone: femur, mirror: LE, spread_mm: 2.0, means: lateral epicondyle}\n"
+        "outline: {compare: [], hidden_by: []}\n",
+        encoding="utf-8",
+    )
+    told = []
+    for anatomy in (load_anatomy(tmp_path / "knee.yaml"), None, HIP):
+        found = Found()
+        check_landmarks(SeenAnatomy(landmarks={"ME": torch.zeros(3)}, anatomy=anatomy), found)
+        told += found.warnings
+    assert told[:2] == [
+        "landmarks: 1 of them; a start pose by landmarks needs 4. Place more of LE.",
+        "landmarks: 1 of them; a start pose by landmarks needs 4.",
+    ]
+    assert "outlines of the bones. Place more of FH-l, FH-r," in told[2]
 
 
 def test_logarithms_that_the_case_takes_for_intensities_are_a_warning(files: Path, tmp_path: Path) -> None:

@@ -369,6 +369,18 @@ def test_inspect_lists_what_stands_together(files: Path, tmp_path: Path) -> None
     assert inspect_path(tmp_path / "pictures").kind == "folder of images"
 
 
+def test_a_ct_beside_its_label_map_is_no_folder_of_masks(files: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "patient" / "volumes"
+    folder.mkdir(parents=True)
+    for name, other in (("ct.nii.gz", "ct.nii.gz"), ("labels.nii.gz", "seg.nii.gz")):
+        (folder / other).write_bytes((files / name).read_bytes())
+    found = inspect_path(folder)
+    assert found.kind == "folder of several things"
+    assert [fact.partition(", ")[0] for fact in found.facts] == ["ct.nii.gz: CT", "seg.nii.gz: label map"]
+    outer = inspect_path(tmp_path / "patient")
+    assert outer.facts == ("volumes: folder of several things",)
+
+
 def test_inspect_tells_other_points_and_boxes_of_segments_without_alarm(files: Path, tmp_path: Path) -> None:
     points = inspect_path(files / "plan.mrk.json")
     assert "none of these names is one of the landmarks FH-l" in points.facts[-1]

@@ -243,6 +243,18 @@ def test_of_a_round_device_no_direction_in_its_frame_is_trusted(tmp_path: Path) 
     ).read_text("utf-8")
 
 
+@pytest.mark.parametrize("trusted", [True, False])
+def test_what_is_told_in_the_femurs_frame_holds_of_a_trusted_result_alone(trusted: bool, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", trusted=trusted)
+    written = json.loads((run / "result.json").read_text(encoding="utf-8"))
+    written["quality"]["device"]["turn_told"] = False
+    (run / "result.json").write_text(json.dumps(written), encoding="utf-8")
+    assert main(["navigate", str(run)]) == 0
+    reasons = json.loads((run / "navigation.json").read_text(encoding="utf-8"))["reasons"]
+    assert len(reasons) == 1 + (not trusted)
+    assert reasons[-1].endswith("those in the frame of the femur hold") == trusted
+
+
 def test_a_result_that_does_not_speak_of_trust_has_none(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     content = json.loads((run / "result.json").read_text(encoding="utf-8"))
