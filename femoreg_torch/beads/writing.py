@@ -133,8 +133,8 @@ def _check_raw_16_bits(image: StoredImage, intensity: Intensity, path: Path) -> 
     low, high = (value.item() for value in image.values.aminmax())
     if low < 0 or high > _MOST_GREY:
         raise InputError(
-            f"{path}: holds values from {low:g} to {high:g}, but raw images of 16 bits are written without beads. Bring "
-            f"its values to 0 to {_MOST_GREY} by a factor, which changes nothing else of raw images."
+            f"{path}: holds values from {low:g} to {high:g}, but raw images of 16 bits are written without beads. "
+            f"Bring them to 0 to {_MOST_GREY} by a factor, which changes nothing else of raw images."
         )
 
 
