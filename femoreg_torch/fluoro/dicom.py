@@ -17,7 +17,7 @@ from femoreg_torch.arrays import check_pixels, quiet
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro.tags import Tags, find_value, read_tags, value_in
 from femoreg_torch.paths import check_readable
-from femoreg_torch.volume.dicom import damaged_header
+from femoreg_torch.volume.dicom import damaged_header, is_dicom
 
 Frames = tuple[int, ...] | Literal["mean"]  # of a cine run: numbers from 1, averaged, or all of them
 Values = NDArray[Any]
@@ -76,12 +76,17 @@ def read_header(path: Path) -> Tags:
 def _dataset(path: Path, **options: Any) -> Any:
     import pydicom  # a fifth of a second, and most images are of other kinds
     from pydicom.errors import InvalidDicomError
+    from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
     check_readable(Path(path))
     try:
-        return pydicom.dcmread(path, **options)
+        dataset = pydicom.dcmread(path, force=is_dicom(path), **options)  # some are written without a preamble
     except InvalidDicomError as error:
         raise InputError(f"{path}: not a DICOM file, and its name ends in no known suffix of an image.") from error
+    if "TransferSyntaxUID" not in dataset.file_meta:  # nor with what says how they are coded, which the first tags show
+        implicit, _ = dataset.original_encoding
+        dataset.file_meta.TransferSyntaxUID = ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian
+    return dataset
 
 
 def _tags(dataset: Any, path: Path) -> Tags:

@@ -200,9 +200,9 @@ def _points(path: Path) -> list[tuple[str, Tensor]]:
 def read_path_points(path: Path) -> tuple[Tensor, Tensor | None]:
     """Entry point (3,) and target (3,), or None, of a planned path, LPS mm, from a file of points or a line.
 
-    Points whose names hold `entry` or `target` are these; of a file without such names the first point is the entry
-    point and the second, if there is one, the target, as the ends of a line of 3D Slicer are. Raises `InputError` for
-    other numbers of points.
+    Points whose names hold `entry` or `target` are these; of two points of which one is named so the other is the other
+    end. Of a file without such names the first point is the entry point and the second, if there is one, the target, as
+    the ends of a line of 3D Slicer are. Raises `InputError` for other numbers of points.
     """
     path = Path(path)
     points = _points(path)
@@ -210,6 +210,10 @@ def read_path_points(path: Path) -> tuple[Tensor, Tensor | None]:
     targets = [point for name, point in points if "target" in name.lower()]
     if not entries and not targets and len(points) in (1, 2):
         entries, targets = [points[0][1]], [point for _, point in points[1:]]
+    elif len(points) == 2 and len(entries) + len(targets) == 1:  # one end of a line was renamed
+        named = (entries or targets)[0]
+        other = [point for _, point in points if point is not named]
+        entries, targets = entries or other, targets or other
     if len(entries) != 1 or len(targets) > 1:
         names = ", ".join(name or "(no name)" for name, _ in points) or "none"
         raise InputError(

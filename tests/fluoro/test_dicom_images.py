@@ -26,6 +26,7 @@ from femoreg_torch.fluoro import (
     Tags,
     carm_settings,
     contradictions,
+    may_be_image,
     read_header,
     read_stored,
 )
@@ -147,6 +148,18 @@ def test_a_sign_says_where_bone_is_dark_whatever_the_case_says_of_values(
         np.testing.assert_array_equal(read.values_as("log").numpy(), float(light.max()) - light)
     read = read_stored(write(tmp_path, PhotometricInterpretation=shown, **relationship))  # as it is shown
     np.testing.assert_array_equal(read.values_as("log").numpy(), PIXELS if shown == "MONOCHROME2" else 4095 - PIXELS)
+
+
+@pytest.mark.parametrize("implicit", [True, False])
+def test_a_file_without_a_preamble_is_an_image_too(tmp_path: Path, implicit: bool) -> None:
+    """As older archives write them: neither a preamble nor what says how the elements are coded."""
+    dataset = pydicom.dcmread(write(tmp_path))
+    bare = Dataset({element.tag: element for element in dataset})
+    path = tmp_path / "bare"
+    bare.save_as(path, implicit_vr=implicit, little_endian=True, enforce_file_format=False)
+    assert path.read_bytes()[:1] == b"\x08"
+    assert may_be_image(path)
+    np.testing.assert_array_equal(values(path), PIXELS)
 
 
 def test_windows_are_for_looking_only(tmp_path: Path) -> None:

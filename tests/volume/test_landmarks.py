@@ -98,7 +98,10 @@ def path_file(folder: Path, names: list[str], **changes: Any) -> Path:
         (["Target", "Entry point"], 20, 10),
         (["FH-l", "entry", "target"], 20, 30),
         (["F-1"], 10, None),
-        (["entry", "F-2"], 10, None),
+        (["entry", "F-2"], 10, 20),  # one end of a line was renamed
+        (["F-1", "entry"], 20, 10),
+        (["F-1", "target"], 10, 20),
+        (["entry"], 10, None),
     ],
 )
 def test_the_ends_of_a_planned_path(tmp_path: Path, names: list[str], entry: float, target: float | None) -> None:
