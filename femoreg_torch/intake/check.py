@@ -41,7 +41,7 @@ from femoreg_torch.intake.found import Found, alike_together
 from femoreg_torch.intake.planes import Picture, side_by_side, stacked
 from femoreg_torch.intake.start_picture import picture_of_start
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
-from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM, model_attenuation
+from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM, model_attenuation, told_of_guide
 from femoreg_torch.volume import is_in_ras, read_ct_told, read_landmarks
 from femoreg_torch.volume.borders import cut_bones
 from femoreg_torch.volume.round_field import round_field
@@ -165,6 +165,8 @@ def _check_device(top: Fields, folder: Path, path: PlannedPath | None, side: Sid
                     f"device: its point {name} lies {beyond:.0f} mm outside the box of its model, which has {box} mm. "
                     "Has the model another unit (inches) or origin than the points?"
                 )
+    if volume is not None and "tip" in points and volume.beyond_mm(points["tip"]) <= BEYOND_MM:  # else enough is said
+        found.warnings += told_of_guide("device", volume, points)
     if {"tip", "base"} <= set(points):
         length = float((points["tip"] - points["base"]).norm())
         if not GUIDE_MM[0] <= length <= GUIDE_MM[1]:
@@ -202,7 +204,9 @@ def _check_written_out(case: Case, found: Found) -> tuple[SeenAnatomy, dict[str,
     images = check_images(case, found)
     for thing in case.objects.values():
         if thing.model is not None:
-            found.attempt(lambda thing=thing: model_attenuation(thing.model))  # type: ignore[misc]
+            model = found.attempt(lambda thing=thing: model_attenuation(thing.model))  # type: ignore[misc]
+            if model is not None:
+                found.warnings += told_of_guide(thing.name, model.volume, thing.points)
     if case.ct_path is None or case.labels_path is None:
         return SeenAnatomy(landmarks=case.landmarks, anatomy=case.anatomy), images
     read = found.attempt(lambda: read_ct_told(cast(Path, case.ct_path)))

@@ -12,12 +12,14 @@ from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM
 from femoreg_torch.registration.scene import Kind, Scene
 from femoreg_torch.registration.sizes import device_size
 from femoreg_torch.registration.tips import TipLength, tip_length
+from femoreg_torch.volume import guide_end
 
 _CASTS_NO_SHADOW = 0.004  # 1/mm: a fifth of water
 _MOST_WITHOUT_SHADOW = 0.08  # share of a model's volume
 # Another place of a device, of the similarity that it adds where it was found, without its best view: of wires beside
 # another one 0.44 and 0.48; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
 _AS_GOOD_ELSEWHERE = 0.37
+_MOST_ASIDE_MM = 0.5  # of a guide's line beside the end of its model; of 30 right devices none lay aside
 # Of a tip beside that of its model, mm, and what a model of that length gains of the similarity near the tip.
 # Seen of 38 right devices of two foreign simulators: at most 0.54 mm and 0.002. Of nine tips 2 to 4 mm off, eight were
 # told: five by 1.1 to 3.3 mm and 0.016 to 0.22, and three, whose end the estimate had emptied, by the model as told
@@ -43,6 +45,21 @@ def doubts_about_units(case: Case, told: Scene, in_doubt: bool) -> tuple[str, ..
         if far or not GUIDE_MM[0] <= length <= GUIDE_MM[1]:
             what = f"its point {far[0]} lies far outside its model" if far else f"its guide is {in_mm(length)} long"
             found.append(f"the {name}: {what}: are model and points in mm? (Inches are 25.4 of them.)")
+    return tuple(found)
+
+
+def doubts_about_told_tips(case: Case, told: Scene) -> tuple[str, ...]:
+    """Guides that run past the end of their model, as they were told, in words."""
+    found = []
+    for name, thing in case.objects.items():
+        if thing.model is None or name not in told.objects or not {"base", "tip"} <= set(thing.points):
+            continue
+        end = guide_end(told.objects[name].volume, thing.points["base"], thing.points["tip"])
+        if end is not None and end.aside_mm > _MOST_ASIDE_MM:
+            found.append(
+                f"the {name}: the line from its base to its tip passes {end.aside_mm:.1f} mm beside the end of its "
+                "model: check these points and the origin of the model"
+            )
     return tuple(found)
 
 

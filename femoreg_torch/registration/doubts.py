@@ -19,6 +19,7 @@ from femoreg_torch.registration.covariance import PoseCovariance
 from femoreg_torch.registration.device_doubts import (
     doubts_about_size,
     doubts_about_the_models,
+    doubts_about_told_tips,
     doubts_about_units,
     doubts_beside_devices,
 )
@@ -93,6 +94,7 @@ def doubts(
         lambda: doubts_about_the_plan(case, scene),
         lambda: doubts_about_the_guide(case, poses),
         lambda: doubts_about_the_models(told, scene),
+        lambda: doubts_about_told_tips(case, told),
     ]
     first = on_all_cores(lambda ask: ask(), others, scene.device)
     clear = scene.where_unsaturated()

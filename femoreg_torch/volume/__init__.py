@@ -5,6 +5,7 @@ from femoreg_torch.volume.bones import BoneLabels, bone_labels
 from femoreg_torch.volume.contradictions import densities, misplaced_labels
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
 from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
+from femoreg_torch.volume.guide_end import GuideEnd, guide_end
 from femoreg_torch.volume.labels import label_box_centre, looked_up
 from femoreg_torch.volume.landmarks import check_inside, read_landmarks, read_path_points, write_landmarks
 from femoreg_torch.volume.mesh import check_closed, voxelise_mesh
@@ -32,6 +33,7 @@ from femoreg_torch.volume.solids import Solid, solid_volumes
 
 __all__ = [
     "BoneLabels",
+    "GuideEnd",
     "Solid",
     "Volume",
     "axis_aligned",
@@ -42,6 +44,7 @@ __all__ = [
     "check_inside",
     "crop",
     "densities",
+    "guide_end",
     "halved",
     "has_names",
     "hu_to_attenuation",

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from femoreg_torch.case import Case, CaseObject, Model, Start
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, CArm, centred_camera, project_points, transform_points
-from femoreg_torch.registration.device_doubts import doubts_about_size, doubts_about_units
+from femoreg_torch.registration.device_doubts import doubts_about_size, doubts_about_told_tips, doubts_about_units
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.registration.sizes import device_size
@@ -159,6 +159,18 @@ def test_a_tip_that_stands_far_out_of_its_model_is_no_doubt_by_itself(scene: Sce
     device = CaseObject("device", model=Model(Path("device.stl"), 5000.0), points={"base": BASE, "tip": 3 * TIP})
     assert doubts_about_units(replace(CASE, objects={"device": device}), scene, False) == ()
     assert len(doubts_about_units(replace(CASE, objects={"device": device}), scene, True)) == 1
+
+
+@pytest.mark.parametrize(("aside_mm", "told"), [(0, False), (2, False), (5, True)])
+def test_a_guide_that_passes_beside_its_model_is_doubted(scene: Scene, aside_mm: float, told: bool) -> None:
+    """Beside a rod of 3 mm: points of another origin than that of the model."""
+    away = float64(0, aside_mm, 0)
+    device = CaseObject(
+        "device", model=Model(Path("device.stl"), 5000.0), points={"base": BASE + away, "tip": TIP + away}
+    )
+    doubts = doubts_about_told_tips(replace(CASE, objects={"device": device}), scene)
+    assert len(doubts) == told
+    assert all("beside the end of its model" in doubt for doubt in doubts)
 
 
 def test_an_image_that_is_saturated_as_a_whole_is_no_error(scene: Scene) -> None:

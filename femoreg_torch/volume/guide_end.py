@@ -1,0 +1,50 @@
+"""Where a model ends along its guide, against the tip that is told of it."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.geometry import transform_points
+from femoreg_torch.volume.grid import Volume
+
+_SOLID = 0.004  # 1/mm: a fifth of water
+_AROUND_MM = 6.0  # of the guide's line: thinner than most handles and arms beside it
+_LOOKED_AT_MM = -40.0, 15.0  # along the guide from the tip: a drill may stand out of a sleeve whose model lacks it
+_END_MM = 8.0  # of the model: the slanted end of a needle is shorter, and its tip lies on one side
+_DIRECTIONS = 72
+
+
+@dataclass(frozen=True)
+class GuideEnd:
+    """How the tip that is told lies to the end of the model."""
+
+    beyond_mm: float  # of the tip, along the guide, past the last of the model; negative: before it
+    off_middle_mm: float  # of the guide's line, from the middle of the model's last 8 mm
+    aside_mm: float  # of the guide's line, beside all that these 8 mm hold; 0 where the line runs through them
+
+
+def guide_end(volume: Volume, base: Tensor, tip: Tensor) -> GuideEnd | None:
+    """The end of a model's attenuation (1/mm) near its guide, which runs from `base` (3,) to `tip` (3,), mm.
+
+    What lies within 6 mm of the guide's line counts, up to 40 mm before the tip. None if nothing does.
+    """
+    axis = (tip - base).double() / (tip - base).norm()
+    filled = (volume.data > _SOLID).nonzero().flip(1).double().cpu()
+    places = transform_points(volume.lps_from_index, filled) - tip
+    along = places @ axis
+    near = (along > _LOOKED_AT_MM[0]) & (along < _LOOKED_AT_MM[1])
+    aside = places[near] - along[near, None] * axis
+    around = aside.norm(dim=1) < _AROUND_MM
+    along, aside = along[near][around], aside[around]
+    if not len(along):
+        return None
+    half_mm = max(volume.spacing_mm) / 2  # of a voxel about its centre
+    last = float(along.max())
+    aside = aside[along > last - _END_MM]
+    across = torch.linalg.svd(axis[None])[2][1:]  # (2, 3), at right angles to the guide
+    turns = torch.arange(_DIRECTIONS, dtype=torch.float64) * (2 * math.pi / _DIRECTIONS)
+    directions = torch.stack([turns.cos(), turns.sin()], 1) @ across
+    gap = float((aside @ directions.T).amin(0).max())  # to the convex hull of what the end holds
+    return GuideEnd(-(last + half_mm), float(aside.mean(0).norm()), max(0.0, gap - half_mm))

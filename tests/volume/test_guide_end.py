@@ -1,0 +1,52 @@
+"""Where a model ends along its guide, of shapes whose ends are known."""
+
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from femoreg_torch.registration.models import told_of_guide
+from femoreg_torch.volume import Volume, guide_end, voxelise_mesh
+
+TIP, BASE = torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 100.0], dtype=torch.float64)
+
+
+def needle(radius: float = 2.0, along: Tensor = BASE) -> trimesh.Trimesh:
+    """A rod of 100 mm whose end lies at the origin."""
+    return trimesh.creation.cylinder(radius, segment=[[0, 0, 0], along.tolist()])
+
+
+def voxels(*meshes: trimesh.Trimesh) -> Volume:
+    return voxelise_mesh(trimesh.util.concatenate(meshes), 0.5, 5000.0)
+
+
+def test_a_right_tip_lies_at_the_end_of_the_model() -> None:
+    end = guide_end(voxels(needle()), BASE, TIP)
+    assert end is not None
+    assert end.beyond_mm == pytest.approx(0, abs=0.5)
+    assert end.off_middle_mm < 0.1
+    assert end.aside_mm == 0
+    assert told_of_guide("device", voxels(needle()), {"tip": TIP, "base": BASE}) == ()
+
+
+@pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [0.6, -0.64, 0.48]])
+@pytest.mark.parametrize(("along", "across"), [(3.0, 0.0), (-4.0, 0.0), (0.0, 3.0), (2.0, 4.0)])
+def test_another_origin_is_told_by_as_much(direction: list[float], along: float, across: float) -> None:
+    axis = torch.tensor(direction, dtype=torch.float64)
+    aside = torch.linalg.cross(axis, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
+    shift = -along * axis + across * aside / aside.norm()
+    end = guide_end(voxels(needle(2.0, 100 * axis)), 100 * axis + shift, TIP + shift)
+    assert end is not None
+    assert end.beyond_mm == pytest.approx(along, abs=0.8)  # partly filled voxels count
+    assert end.off_middle_mm == pytest.approx(across, abs=0.15)
+    assert end.aside_mm == pytest.approx(max(0, across - 2), abs=0.5)
+    (told,) = told_of_guide("device", voxels(needle(2.0, 100 * axis)), {"tip": TIP + shift, "base": 100 * axis + shift})
+    assert ("the end of its model" in told, "off the middle" in told) == (along != 0, across != 0)
+
+
+def test_what_stands_beside_a_guide_is_no_end_of_it() -> None:
+    pin = trimesh.creation.cylinder(2.0, segment=[[12, 0, -14], [12, 0, 40]])
+    end = guide_end(voxels(needle(), pin), BASE, TIP)
+    assert end is not None
+    assert end.beyond_mm == pytest.approx(0, abs=0.5)
+    assert guide_end(voxels(pin), BASE, TIP) is None
