@@ -85,7 +85,7 @@ def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imagi
     longer than the device, its end may have been estimated to be empty; so the model as told is asked for its tip, too.
     """
     found = []
-    for name, kind in devices(scene, poses):
+    for name, kind in _models(scene, poses):
         words = []
         shown = device_size(scene, poses, name, kind, imaging)
         if shown is not None and abs(shown.factor - 1) > _MOST_OFF_SIZE and shown.gain > _LEAST_GAIN_OF_SIZE:
@@ -105,6 +105,20 @@ def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imagi
                 "size and unit, and the voxel size of the CT"
             )
     return tuple(found)
+
+
+def _models(scene: Scene, poses: Poses) -> list[tuple[str, Kind]]:
+    """Devices, and whatever else has a model, each with the first kind of images that shows it.
+
+    That need not be a kind of their own: where all images show a drill, its length is to be asked too. The anchor is
+    not asked, as the C-arm's poses follow it.
+    """
+    found = devices(scene, poses)
+    for name in poses.camera1_from:
+        thing = scene.objects[name]
+        if thing.parts and name != scene.anchor and all(name != other for other, _ in found):
+            found.append((name, scene.there(thing.shown_in, range(scene.views))[0][0]))
+    return found
 
 
 def _tip_elsewhere(

@@ -102,6 +102,28 @@ def test_a_tip_of_another_length_is_told_by_as_much(scene: Scene, mm: float) -> 
     assert ("before the tip of its model" if mm > 0 else "beyond the tip of its model") in doubt
 
 
+@pytest.mark.parametrize("longer_mm", [0, 2])
+def test_a_device_that_all_images_show_is_asked_too(scene: Scene, longer_mm: int) -> None:
+    """Of a biplane, say, that is used while a drill is in."""
+    model = tool(60.0 - longer_mm)
+    pelvis, femur, device = (scene.objects[name] for name in ("pelvis", "femur", "device"))
+    there = replace(
+        scene,
+        images={"image": scene.images["device"]},
+        objects={
+            "pelvis": replace(pelvis, shown_in=("image",)),
+            "femur": replace(femur, shown_in=("image",)),
+            "device": replace(device, shown_in=("image",), volume=model, parts=(model,)),
+        },
+    )
+    case = replace(
+        CASE, objects={"device": CaseObject("device", points={"base": BASE, "tip": TIP - float64(0, 0, longer_mm)})}
+    )
+    told = doubts_about_size(case, there, there, TRUTH, PLAIN)
+    assert len(told) == (longer_mm > 0)
+    assert all("the guide of the device end" in doubt for doubt in told)
+
+
 @pytest.mark.parametrize("given", [False, True])
 def test_soft_tissue_lies_about_the_bones_while_a_tip_is_asked(
     scene: Scene, given: bool, monkeypatch: pytest.MonkeyPatch
