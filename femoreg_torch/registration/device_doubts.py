@@ -91,7 +91,7 @@ def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imagi
         if shown is not None and abs(shown.factor - 1) > _MOST_OFF_SIZE and shown.gain > _LEAST_GAIN_OF_SIZE:
             words.append(
                 f"the {name} about {100 * abs(shown.factor - 1):.1f} % "
-                f"{'larger' if shown.factor > 1 else 'smaller'} than its model, beside the bones"
+                f"{'larger' if shown.factor > 1 else 'smaller'} than its model, beside the {scene.anchor}"
             )
         off = _tip_elsewhere(case, told, scene, poses, name, kind, imaging)
         if off is not None:

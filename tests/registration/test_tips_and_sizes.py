@@ -159,7 +159,7 @@ def test_a_model_of_another_size_is_told(scene: Scene, factor: float, words: str
     assert shown.factor == pytest.approx(1 / factor, abs=0.012)
     (doubt,) = doubts_about_size(CASE, wrong, wrong, TRUTH, PLAIN)
     assert words in doubt
-    assert "than its model, beside the bones" in doubt
+    assert "than its model, beside the pelvis" in doubt
 
 
 @pytest.mark.parametrize(
