@@ -2,9 +2,13 @@
 
 from dataclasses import replace
 
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
 from femoreg_torch.case import Case
 from femoreg_torch.errors import in_mm
-from femoreg_torch.geometry import Poses
+from femoreg_torch.geometry import Poses, project_points, transform_points
 from femoreg_torch.registration.besides import besides, rival
 from femoreg_torch.registration.calibration import devices
 from femoreg_torch.registration.imaging import Imaging
@@ -16,6 +20,7 @@ from femoreg_torch.volume import guide_end
 
 _CASTS_NO_SHADOW = 0.004  # 1/mm: a fifth of water
 _MOST_WITHOUT_SHADOW = 0.08  # share of a model's volume
+_ENCLOSED_MM = 2.5  # half of the width of a gap that counts as within: a drill in its sleeve
 # Another place of a device, of the similarity that it adds where it was found, without its best view: of wires beside
 # another one 0.44 and 0.48; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
 _AS_GOOD_ELSEWHERE = 0.37
@@ -65,19 +70,63 @@ def doubts_about_told_tips(case: Case, told: Scene) -> tuple[str, ...]:
     return tuple(found)
 
 
-def doubts_about_the_models(told: Scene, scene: Scene) -> tuple[str, ...]:
-    """Models of which a part was found to attenuate next to nothing, in words."""
+def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[str, ...]:
+    """Models of which a part was found to attenuate next to nothing, in words.
+
+    What lies within other parts, as a drill in its sleeve, does not count: the images tell the two together, and how
+    the shadow is shared out among them is open. Nor does what no image shows, as the end of a handle: whatever is
+    estimated of it is chance.
+    """
     found = []
     for name, thing in scene.objects.items():
         before = told.objects[name].volume.data
         inside = before > 0.5 * before.max()
-        share = float((thing.volume.data[inside] < _CASTS_NO_SHADOW).double().mean())
+        empty = inside & (thing.volume.data < _CASTS_NO_SHADOW)
+        share = float(empty.sum() / inside.sum())
+        if share > _MOST_WITHOUT_SHADOW:
+            empty &= ~_closed(thing.volume.data >= _CASTS_NO_SHADOW, round(_ENCLOSED_MM / min(thing.volume.spacing_mm)))
+            empty[empty.clone()] = _in_view(scene, poses, name, empty.nonzero())
+            share = float(empty.sum() / inside.sum())
         if share > _MOST_WITHOUT_SHADOW:
             found.append(
                 f"{100 * share:.0f} % of the {name}'s volume casts no shadow: check that its model is the one in the "
                 "images, and not mirrored, and that its nominal pose is not far off (see the preset fast_wide_device)"
             )
     return tuple(found)
+
+
+def _in_view(scene: Scene, poses: Poses, name: str, voxels: Tensor) -> Tensor:
+    """Which voxels (n, 3) of an object, by their z, y and x, some image that shows it has in its exposed field."""
+    thing = scene.objects[name]
+    points = transform_points(thing.volume.lps_from_index, voxels.flip(1).double().cpu())
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for kind, view in scene.there(thing.shown_in, range(scene.views)):
+        camera = scene.camera(poses, view)
+        column, row = project_points(camera, transform_points(poses.camera_from(name)[view], points)).round().unbind(1)
+        height, width = camera.shape
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        field = scene.field(kind, view)
+        if field is not None:
+            inside[inside.clone()] = field.cpu()[row[inside].long(), column[inside].long()]
+        seen |= inside
+    return seen.to(voxels.device)
+
+
+def _closed(solid: Tensor, reach: int) -> Tensor:
+    """A solid (Z, Y, X), bool, with all gaps that are no wider than twice so many voxels (a closing by a cube)."""
+    grown = _grown(F.pad(solid[None, None].float(), (reach + 1,) * 6), reach)
+    closed = 1 - _grown(1 - grown, reach)
+    inner = slice(reach + 1, -reach - 1)
+    return closed[0, 0, inner, inner, inner] > 0.5
+
+
+def _grown(solid: Tensor, reach: int) -> Tensor:
+    """A solid (1, 1, Z, Y, X) of zeros and ones, wider by so many voxels along every axis."""
+    for axis in range(3):
+        size, padding = [1, 1, 1], [0, 0, 0]
+        size[axis], padding[axis] = 2 * reach + 1, reach
+        solid = F.max_pool3d(solid, size, 1, padding)
+    return solid
 
 
 def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:

@@ -93,7 +93,7 @@ def doubts(
         lambda: doubts_about_motion(covariance),
         lambda: doubts_about_the_plan(case, scene),
         lambda: doubts_about_the_guide(case, poses),
-        lambda: doubts_about_the_models(told, scene),
+        lambda: doubts_about_the_models(told, scene, poses),
         lambda: doubts_about_told_tips(case, told),
     ]
     first = on_all_cores(lambda ask: ask(), others, scene.device)

@@ -77,8 +77,30 @@ def test_what_is_its_own_mirror_image_is_not_doubted(scene: Scene) -> None:
 
 
 def test_a_model_of_which_a_part_casts_no_shadow_is_doubted(scene: Scene) -> None:
-    assert doubts_about_the_models(scene, scene) == ()
+    assert doubts_about_the_models(scene, scene, TRUTH) == ()
     data = VOLUMES["device"].data.clone()
     data[:, :, 15:] = 0.001
-    (doubt,) = doubts_about_the_models(scene, with_volume(scene, "device", VOLUMES["device"].with_data(data)))
+    (doubt,) = doubts_about_the_models(scene, with_volume(scene, "device", VOLUMES["device"].with_data(data)), TRUTH)
     assert "of the device's volume casts no shadow" in doubt
+
+
+def test_a_drill_in_its_sleeve_need_cast_no_shadow_of_its_own(scene: Scene) -> None:
+    """The images tell the two together; of one that stands out of its sleeve, or of a handle, they tell each part."""
+    y, x = torch.meshgrid(torch.arange(40) - 19.5, torch.arange(40) - 19.5, indexing="ij")
+    radius = torch.hypot(y, x)
+    told = torch.zeros(60, 40, 40)
+    told[10:50] = 0.1 * (radius < 9).float()
+
+    def estimated(hollow: torch.Tensor) -> Scene:
+        data = told.clone()
+        data[10:50, hollow] = 0.0
+        return with_volume(scene, "device", Volume(data, place))
+
+    place = axis_aligned((0.5, 0.5, 0.5), (-10.0, -10.0, -15.0))
+    whole = with_volume(scene, "device", Volume(told, place))
+    assert doubts_about_the_models(whole, estimated(radius < 4), TRUTH) == ()
+    (doubt,) = doubts_about_the_models(whole, estimated(radius > 6), TRUTH)
+    assert "of the device's volume casts no shadow" in doubt
+    away = TRUTH.camera1_from["device"].clone()
+    away[0, 3] += 300  # beside the detector: nothing is known of what no image shows
+    assert doubts_about_the_models(whole, estimated(radius > 6), TRUTH.with_object("device", away)) == ()

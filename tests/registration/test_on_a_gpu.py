@@ -168,7 +168,8 @@ def test_a_plan_ends_where_it_ends_on_the_cpu(scene: Scene, gpu: PretendedGpu | 
         assert error(expected, TRUTH.camera1_from[name], REFERENCE_POINTS[name])[0] < 5, name
     assert there.trace[-1].cost == pytest.approx(here.trace[-1].cost, abs=1e-3)
     assert there.scene.objects["device"].volume.data.device.type == "cuda"
-    assert doubts_about_the_models(scene.to(CUDA), there.scene) == doubts_about_the_models(scene, here.scene)
+    told = doubts_about_the_models(scene, here.scene, here.poses)
+    assert doubts_about_the_models(scene.to(CUDA), there.scene, there.poses) == told
 
     # what is asked of a result, at the same poses
     scenes, poses = (here.scene, here.scene.to(CUDA)), here.poses
