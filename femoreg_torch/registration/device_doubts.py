@@ -2,18 +2,19 @@
 
 from dataclasses import replace
 
+import numpy as np
 import torch
-import torch.nn.functional as F
+from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.case import Case
 from femoreg_torch.errors import in_mm
-from femoreg_torch.geometry import Poses, project_points, transform_points
+from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.registration.besides import besides, rival
 from femoreg_torch.registration.calibration import devices
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM
-from femoreg_torch.registration.scene import Kind, Scene
+from femoreg_torch.registration.scene import Kind, Scene, in_view
 from femoreg_torch.registration.sizes import device_size
 from femoreg_torch.registration.tips import TipLength, tip_length
 from femoreg_torch.volume import guide_end
@@ -84,8 +85,11 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
         empty = inside & (thing.volume.data < _CASTS_NO_SHADOW)
         share = float(empty.sum() / inside.sum())
         if share > _MOST_WITHOUT_SHADOW:
-            empty &= ~_closed(thing.volume.data >= _CASTS_NO_SHADOW, round(_ENCLOSED_MM / min(thing.volume.spacing_mm)))
-            empty[empty.clone()] = _in_view(scene, poses, name, empty.nonzero())
+            width = 2 * round(_ENCLOSED_MM / min(thing.volume.spacing_mm)) + 1
+            empty &= ~_within_others(thing.volume.data >= _CASTS_NO_SHADOW, width)
+            where = empty.nonzero()
+            points = transform_points(thing.volume.lps_from_index, where.flip(1).double().cpu())
+            empty[where.unbind(1)] = in_view(scene, poses, name, points).to(empty.device)
             share = float(empty.sum() / inside.sum())
         if share > _MOST_WITHOUT_SHADOW:
             found.append(
@@ -95,38 +99,10 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
     return tuple(found)
 
 
-def _in_view(scene: Scene, poses: Poses, name: str, voxels: Tensor) -> Tensor:
-    """Which voxels (n, 3) of an object, by their z, y and x, some image that shows it has in its exposed field."""
-    thing = scene.objects[name]
-    points = transform_points(thing.volume.lps_from_index, voxels.flip(1).double().cpu())
-    seen = torch.zeros(len(points), dtype=torch.bool)
-    for kind, view in scene.there(thing.shown_in, range(scene.views)):
-        camera = scene.camera(poses, view)
-        column, row = project_points(camera, transform_points(poses.camera_from(name)[view], points)).round().unbind(1)
-        height, width = camera.shape
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        field = scene.field(kind, view)
-        if field is not None:
-            inside[inside.clone()] = field.cpu()[row[inside].long(), column[inside].long()]
-        seen |= inside
-    return seen.to(voxels.device)
-
-
-def _closed(solid: Tensor, reach: int) -> Tensor:
-    """A solid (Z, Y, X), bool, with all gaps that are no wider than twice so many voxels (a closing by a cube)."""
-    grown = _grown(F.pad(solid[None, None].float(), (reach + 1,) * 6), reach)
-    closed = 1 - _grown(1 - grown, reach)
-    inner = slice(reach + 1, -reach - 1)
-    return closed[0, 0, inner, inner, inner] > 0.5
-
-
-def _grown(solid: Tensor, reach: int) -> Tensor:
-    """A solid (1, 1, Z, Y, X) of zeros and ones, wider by so many voxels along every axis."""
-    for axis in range(3):
-        size, padding = [1, 1, 1], [0, 0, 0]
-        size[axis], padding[axis] = 2 * reach + 1, reach
-        solid = F.max_pool3d(solid, size, 1, padding)
-    return solid
+def _within_others(solid: Tensor, width: int) -> Tensor:
+    """Voxels (Z, Y, X), bool, of a solid and of gaps in it that are no wider than so many voxels."""
+    closed = ndimage.grey_closing(solid.cpu().numpy().astype(np.uint8), size=width)
+    return torch.from_numpy(closed > 0).to(solid.device)
 
 
 def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from femoreg_torch.geometry import (
     about_point,
     exp_se3,
     first_view_only,
+    project_points,
     transform_points,
 )
 from femoreg_torch.registration.intrinsics import Intrinsics
@@ -261,6 +262,22 @@ def motions(bodies: Sequence[Body], deltas: Sequence[Tensor]) -> list[Tensor]:
         return []
     twists = torch.stack([body.twist(delta) for body, delta in zip(bodies, deltas, strict=True)])
     return list(about_point(exp_se3(twists), torch.stack([body.centre for body in bodies])[:, None]))
+
+
+def in_view(scene: Scene, poses: Poses, name: str, points: Tensor) -> Tensor:
+    """Which points (N, 3) of an object, mm in its space, some image that holds it shows in its exposed field: (N,)."""
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for kind, view in scene.there(scene.objects[name].shown_in, range(scene.views)):
+        camera = scene.camera(poses, view)
+        pixels = project_points(camera, transform_points(poses.camera_from(name)[view], points)).round().long()
+        size = torch.tensor(camera.shape[::-1])
+        inside = ((pixels >= 0) & (pixels < size)).all(1)
+        field = scene.field(kind, view)
+        if field is not None:
+            column, row = pixels.clamp_min(0).minimum(size - 1).unbind(1)
+            inside &= field.cpu()[row, column]
+        seen |= inside
+    return seen
 
 
 def reference_point_in_view(scene: Scene, poses: Poses, name: str, view: int) -> Tensor:

@@ -5,16 +5,15 @@ turn. So the object is turned far, about the long axis of what is in view of it,
 """
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from femoreg_torch.geometry import Poses, project_points, transform_points
+from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs
-from femoreg_torch.registration.scene import Body, Kind, Scene
+from femoreg_torch.registration.scene import Body, Scene, in_view
 from femoreg_torch.similarity import Similarity
 
 TOLD = 0.008
@@ -37,7 +36,7 @@ def loss_by_turning(
     Infinite where no image shows it. nan where a similarity is.
     """
     images = scene.there(scene.objects[name].shown_in, range(scene.views))
-    points = _in_view(scene, poses, name, images)
+    points = _points_in_view(scene, poses, name)
     if len(points) < 2:
         return math.inf
     long = long_axis(points)
@@ -54,21 +53,10 @@ def long_axis(points: Tensor) -> Tensor:
     return axes[:, 2 if moments[2] - moments[1] > moments[1] - moments[0] else 0]
 
 
-def _in_view(scene: Scene, poses: Poses, name: str, images: Sequence[tuple[Kind, int]]) -> Tensor:
+def _points_in_view(scene: Scene, poses: Poses, name: str) -> Tensor:
     """Filled voxels (N, 3) of an object, mm in camera 1, that an exposed pixel of some image shows."""
     volume = scene.objects[name].volume
     places = (volume.data > _FILLED).nonzero().cpu()
     places = places[:: 1 + len(places) // _MOST_POINTS]
     points = transform_points(volume.lps_from_index, places.flip(1).double())
-    seen = torch.zeros(len(points), dtype=torch.bool)
-    for kind, view in images:
-        camera = scene.camera(poses, view)
-        pixels = project_points(camera, transform_points(poses.camera_from(name)[view], points)).round().long()
-        size = torch.tensor(camera.shape[::-1])
-        inside = ((pixels >= 0) & (pixels < size)).all(1)
-        field = scene.field(kind, view)
-        if field is not None:
-            column, row = pixels.clamp_min(0).minimum(size - 1).unbind(1)
-            inside &= field.cpu()[row, column]
-        seen |= inside
-    return transform_points(poses.camera1_from[name], points[seen])
+    return transform_points(poses.camera1_from[name], points[in_view(scene, poses, name, points)])
