@@ -57,8 +57,8 @@ class Start:
 def start_by_detection(case: Case, scene: Scene, detection: Detection, find: Detector | None = None) -> StartRecord:
     """The pose (4, 4) of the scene's anchor from what the network sees in view 1, and how it came.
 
-    Raises `InputError` as `find_start` does, with the image's name, and how the image would have to be turned if `find`
-    then sees landmarks that agree.
+    Raises `InputError` as `find_start` does, with the image's name, and how the image would have to be turned, or which
+    view to put first, if `find` then sees landmarks that agree.
     """
     image, field = scene.image(scene.first_kind, 0), scene.field(scene.first_kind, 0)
     anatomy = case.anatomy or HIP
@@ -74,10 +74,11 @@ def start_by_detection(case: Case, scene: Scene, detection: Detection, find: Det
                 f"more than {greys} grey value{'s' * (greys != 1)}, so hardly a bone is to be seen. Is it of 8 bits, "
                 "in proportion to the light? Export it with 16 bits, or its logarithm."
             ) from error
+        other = () if find is None else _told_other_view(case, scene, anatomy, find)
         if case.display_of(0).source in ("left", "right"):
-            raise InputError(f"{seen.removesuffix(_BY_HAND).rstrip()} {_OF_A_SIDE}") from error
+            raise InputError(" ".join([seen.removesuffix(_BY_HAND).rstrip(), _OF_A_SIDE, *other])) from error
         turned = () if find is None else _told_turned(case, scene, anatomy, find)
-        raise InputError(" ".join([seen, *turned])) from error
+        raise InputError(" ".join([seen, *(turned or other)])) from error
     stored = case.display_of(0).pixels_to_stored(detection.pixels, case.carm.camera)
     if (distortion := view_distortion(case, 0)) is not None:
         stored = torch.from_numpy(distortion.bent(stored.numpy()))
@@ -123,6 +124,29 @@ def _told_turned(case: Case, scene: Scene, anatomy: Anatomy, find: Detector) -> 
                 f"head up? Then write `display: {{turned: {turned}}}`.",
             )
     return ()
+
+
+def _told_other_view(case: Case, scene: Scene, anatomy: Anatomy, find: Detector) -> tuple[str, ...]:
+    """In words, which of the other views shows most landmarks that agree; nothing where none shows enough of them."""
+    agree: dict[int, int] = {}
+    for _, view in scene.there([scene.first_kind], range(1, scene.views)):
+        image, field, beam = (
+            scene.image(scene.first_kind, view),
+            scene.field(scene.first_kind, view),
+            case.display_of(view).beam,
+        )
+        try:
+            start = find_start(
+                case.landmarks, look_at(scene, view, find), image, case.carm.camera, scene.outline, anatomy, field, beam
+            )
+        except InputError:
+            continue
+        if not start.few:
+            agree[view] = int(start.pnp.inliers.sum())
+    if not agree:
+        return ()
+    best = max(agree, key=lambda view: agree[view])
+    return (f"View {best + 1} shows {agree[best]} landmarks that agree: list it first under `views`.",)
 
 
 def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) -> StartRecord:

@@ -98,6 +98,29 @@ def test_a_picture_that_shows_more_when_turned_is_asked_to_be(display: Display, 
         start_by_detection(case, plain, find(image, CAMERA), lambda *_: detection(1, inverted=False))
 
 
+@pytest.mark.parametrize("display", [Display(), Display("left")])
+def test_a_view_that_shows_more_is_asked_to_be_the_first(display: Display) -> None:
+    landmarks = dict(zip(NAMES[:6], torch.tensor(SIX, dtype=torch.float64), strict=True))
+    found = detection(6, inverted=False)
+    found.pixels[:6] = project_points(CAMERA, transform_points(POSE, torch.stack(list(landmarks.values()))))
+    images = tuple(torch.rand(CAMERA.shape, generator=torch.Generator().manual_seed(seed)) for seed in (3, 4, 5))
+    views = (
+        View({"anatomy": Path("view1.tif")}, display=display),
+        *[View({"anatomy": Path("other.tif")}, display=Display())] * 2,
+    )
+    case = replace(case_of(landmarks), views=views)
+
+    def find(shown: torch.Tensor, _: object) -> Detection:
+        return found if torch.equal(shown, images[2]) else detection(3, inverted=False)
+
+    three = replace(scene(), images={"anatomy": images})
+    with pytest.raises(InputError, match=r"view1.tif: .*View 3 shows 6 landmarks that agree: list it first"):
+        start_by_detection(case, three, detection(3, inverted=False), find)
+    with pytest.raises(InputError) as nothing:
+        start_by_detection(case, three, detection(3, inverted=False), lambda *_: detection(3, inverted=False))
+    assert "list it first" not in str(nothing.value)
+
+
 def test_a_rotation_left_open_is_refused_where_no_outline_can_mend_it() -> None:
     """Six landmarks of one hip, seen exactly but trusted to some mm only."""
     points = torch.tensor(SIX, dtype=torch.float64)

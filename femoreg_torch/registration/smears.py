@@ -1,0 +1,100 @@
+"""Images that something smeared along one direction while they were taken: a C-arm that shook, or a patient.
+
+Images without and with a device, from one C-arm pose, show the same edges elsewhere. In one that was smeared, those
+across the smear are weaker than in the other, and those along it are not. Exposure, dose, scattered light, and how
+sharp a C-arm is, are nearly the same along all directions.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import linalg, ndimage
+from torch import Tensor
+
+from femoreg_torch.fluoro import natural
+from femoreg_torch.geometry import Camera, Poses
+from femoreg_torch.registration.imaging import draw
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.scene import Kind, Scene
+from femoreg_torch.registration.weights import dilated
+
+_LEVEL = Level(pixel_mm=1.0, step_mm=1.0)
+_SIGMA_MM = 1.5  # on the detector, of the edges' Gaussian: coarser than noise, finer than a smear that matters
+_AROUND_MM = 6.0  # on the detector, beside what one of the images lacks, and beside what is not exposed
+_CHANGE = 0.15  # of the logarithm of intensity: one of the images lacks what is there
+_LEAST_SHARE = 0.05  # of the exposed part, that can be compared
+
+
+@dataclass(frozen=True)
+class Smear:
+    """How the image of a kind differs in sharpness from that of the first kind of the same view (from 0)."""
+
+    kind: Kind
+    view: int
+    kept: float  # strength of the edges, beside the other image, where it is least; of that where it is greatest
+
+
+def smears(scene: Scene, poses: Poses) -> list[Smear]:
+    """The images of other kinds than the first, each compared with that of the first kind of its view.
+
+    Views that lack one of the two, or have too little exposed that both show, are left out.
+    """
+    others = [kind for kind in scene.images if kind != scene.first_kind]
+    asked = [(kind, view) for kind, view in scene.there(others, range(scene.views))]
+    return [
+        Smear(kind, view, kept)
+        for kind, view in asked
+        if scene.there([scene.first_kind], (view,)) and (kept := _kept(scene, poses, kind, view)) is not None
+    ]
+
+
+def _kept(scene: Scene, poses: Poses, kind: Kind, view: int) -> float | None:
+    camera = _LEVEL.camera(scene.carm.camera)
+    images = [scene.image(each, view) for each in (scene.first_kind, kind)]
+    first, other = (_LEVEL.image(image, scene.carm.camera).cpu().double().numpy() for image in images)
+    where = _shown_by_both(scene, poses, kind, view)
+    sigma = [_SIGMA_MM / mm for mm in camera.pixel_mm]
+    if all(map(natural, images)):  # only then it is known how strong a shadow is
+        change = ndimage.gaussian_filter(other - first, sigma)
+        change -= np.median(change[where]) if where.any() else 0.0  # exposures differ
+        where &= ~_dilated(np.abs(change) > _CHANGE, camera)
+    if where.mean() < _LEAST_SHARE:
+        return None
+    of_first, of_other = (_edges(image, sigma, where) for image in (first, other))
+    if np.linalg.matrix_rank(of_first) < len(of_first):
+        return None
+    least, greatest = linalg.eigvalsh(of_other, of_first)
+    return math.sqrt(least / greatest)
+
+
+def _shown_by_both(scene: Scene, poses: Poses, kind: Kind, view: int) -> np.ndarray:
+    """Pixels (H, W) of the level that are exposed in both images, away from shutters and from what one lacks."""
+    names = [
+        name
+        for name in poses.camera1_from
+        if (scene.first_kind in scene.objects[name].shown_in) != (kind in scene.objects[name].shown_in)
+    ]
+    camera = poses.camera(view, _LEVEL.camera(scene.carm.camera))
+    exposed = torch.ones(camera.shape, dtype=torch.bool, device=scene.device)
+    for each in (scene.first_kind, kind):
+        if (field := scene.field(each, view)) is not None:
+            exposed &= _LEVEL.field(field, scene.carm.camera)
+    lacking = ~exposed
+    if names:
+        where = torch.stack([poses.camera_from(name)[view] for name in names])[None]
+        lacking |= draw([scene.objects[name] for name in names], where, camera, _LEVEL.step_mm)[0] > 0
+    away: Tensor = ~dilated(lacking, _AROUND_MM, camera)
+    return away.cpu().numpy()
+
+
+def _dilated(mask: np.ndarray, camera: Camera) -> np.ndarray:
+    return dilated(torch.from_numpy(mask), _AROUND_MM, camera).numpy()
+
+
+def _edges(image: np.ndarray, sigma: list[float], where: np.ndarray) -> np.ndarray:
+    """The structure tensor (2, 2) of an image (H, W), summed over the pixels `where`."""
+    slopes = np.stack([ndimage.gaussian_filter(image, sigma, order)[where] for order in ((1, 0), (0, 1))])
+    product: np.ndarray = slopes @ slopes.T
+    return product
