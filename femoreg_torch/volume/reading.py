@@ -19,6 +19,7 @@ from femoreg_torch.volume.dicom import choose_series, is_dicom, read_series
 from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.itk import read_itk
 from femoreg_torch.volume.segments import has_names, read_segments
+from femoreg_torch.volume.text_headers import check_voxel_size
 
 _LEAST_INSIDE = 0.98  # of what a label map labels, less than this within the CT is told
 _FINEST_MM, _COARSEST_MM = 0.01, 50.0  # voxels: of a micro-CT, and more than those of any clinical scan
@@ -54,6 +55,7 @@ def _oriented(image: sitk.Image, path: Path) -> sitk.Image:
             f"{path}: a 3-D volume of one channel was expected, found {size} voxels of "
             f"{image.GetNumberOfComponentsPerPixel()} channel(s). Save one volume of it as a file of its own."
         )
+    check_voxel_size(path)
     spacing = image.GetSpacing()
     if not (min(spacing) >= _FINEST_MM and max(spacing) <= _COARSEST_MM):
         told = " × ".join(f"{s:.3g}" for s in spacing)

@@ -19,6 +19,8 @@ from femoreg_torch.errors import InputError, shortened
 META_SUFFIXES, NRRD_SUFFIXES = (".mha", ".mhd"), (".nrrd", ".nhdr")
 _LONGEST_HEADER = 2**20  # bytes; a segmentation of 3D Slicer names all its segments there
 _CHUNK = 2**20
+_META_SIZE = re.compile(rb"^Element(Spacing|Size)[ \t]*=", re.MULTILINE)
+_NRRD_SIZE = re.compile(rb"^(spacings|space directions):", re.MULTILINE | re.IGNORECASE)
 _OTHER_UNITS = {  # of lengths; what else may stand there says nothing, as "" for an axis that is no length
     "m", "meter", "meters", "metre", "metres", "dm", "cm", "centimeter", "centimeters", "centimetre", "centimetres",
     "um", "µm", "μm", "micron", "microns", "micrometer", "micrometers", "nm", "in", "inch", "inches",
@@ -69,6 +71,26 @@ def check_text_header(path: Path) -> None:
     values = _values(path)
     if values is not None:
         _check_values(values, path)
+
+
+def check_voxel_size(path: Path) -> None:
+    """Raises `InputError` for a MetaImage or NRRD file (by its name) that does not tell how large its voxels are.
+
+    ITK takes 1 mm for that. Files of other names are passed.
+    """
+    name = path.name.lower()
+    if not name.endswith((*META_SUFFIXES, *NRRD_SUFFIXES)):
+        return
+    with opened(path) as file:
+        header = file.read(_LONGEST_HEADER)
+    if name.endswith(META_SUFFIXES):
+        told, line = _META_SIZE.search(header.partition(b"ElementDataFile")[0]), "ElementSpacing = x y z"
+    else:
+        told, line = _NRRD_SIZE.search(re.split(rb"\r?\n\r?\n", header, maxsplit=1)[0]), "spacings: x y z"
+    if told is None:
+        raise InputError(
+            f"{path}: no size of voxels stands in its header. Export it anew, or add the line `{line}`, in mm."
+        )
 
 
 def file_of_values(path: Path) -> Path:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import SimpleITK as sitk
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.volume import Volume, read_label_map, read_volume
 from femoreg_torch.volume.itk import read_itk
 
 VOXELS = np.random.default_rng(0).integers(-900, 900, (9, 8, 7)).astype(np.int16)
@@ -47,8 +49,10 @@ def test_names_of_files_that_are_not_there(tmp_path: Path) -> None:
             paths[-1].write_bytes(content.replace(b"a.raw", source.encode("latin-1")))
     code = """
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from femoreg_torch.errors import InputError
+from femoreg_torch.volume import Volume, read_label_map, read_volume
 from femoreg_torch.volume.itk import read_itk
 for path in sys.argv[1:]:
     try:
@@ -147,3 +151,23 @@ def test_units_that_are_mm_or_say_nothing_are_read(units: str, tmp_path: Path) -
     path = written(tmp_path / "a.nrrd")
     path.write_bytes(path.read_bytes().replace(b"space dir", f"space units: {units}\nspace dir".encode(), 1))
     assert (sitk.GetArrayFromImage(read_itk(path)) == VOXELS).all()
+
+
+@pytest.mark.parametrize("read", [read_volume, read_label_map])
+@pytest.mark.parametrize("name", ["a.mha", "a.mhd", "a.nrrd", "a.nhdr"])
+def test_voxels_of_no_size_are_refused(read: Callable[[Path], Volume], name: str, tmp_path: Path) -> None:
+    """ITK reads them as of 1 mm, in which a CT of other voxels is another femur."""
+    path = tmp_path / name
+    sitk.WriteImage(sitk.GetImageFromArray(VOXELS.clip(0)), str(path))
+    assert read(path).spacing_mm == (1.0, 1.0, 1.0)
+    kept = [line for line in path.read_bytes().split(b"\n") if not line.startswith((b"ElementSpacing", b"space dir"))]
+    path.write_bytes(b"\n".join(kept))
+    with pytest.raises(InputError, match=r"no size of voxels .* add the line `(ElementSpacing = |spacings: )x y z`"):
+        read(path)
+
+
+def test_the_line_that_is_asked_for_mends_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.nrrd"
+    header = "NRRD0004\ntype: int16\ndimension: 3\nsizes: 7 8 9\nencoding: raw\nendian: little\n"
+    path.write_bytes(header.encode() + b"spacings: 0.5 0.5 2\n\n" + VOXELS.tobytes())
+    assert read_volume(path).spacing_mm == (0.5, 0.5, 2.0)
