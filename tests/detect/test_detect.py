@@ -116,6 +116,14 @@ def test_an_image_on_its_head_is_read_turned(image: Tensor) -> None:
     assert detection.segmentation[:, 5].argmax(0).eq(0).all()
 
 
+@pytest.mark.parametrize(("shown", "turned"), [(3, False), (4, True)])
+def test_a_few_landmarks_do_not_stand_an_image_on_its_head(shown: int, turned: bool, image: Tensor) -> None:
+    truth = project_points(CAMERA, transform_points(CAMERA_FROM_LPS, POINTS))
+    visible = torch.arange(LANDMARKS) < shown
+    assert detect(planting(truth, visible), image, CAMERA, PLAIN).visible.sum() > 0
+    assert detect(planting(truth, visible), image.rot90(2), CAMERA, PLAIN).turned == turned
+
+
 def test_the_segmentations_camera(image: Tensor) -> None:
     detection = detect(planting(torch.full((LANDMARKS, 2), 700.0), torch.ones(LANDMARKS).bool()), image, CAMERA, PLAIN)
     assert detection.segmentation.shape == (CLASSES, *detection.network_camera.shape)
