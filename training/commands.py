@@ -25,7 +25,7 @@ def train(
     hip14.safetensors, the moving average of the weights at their best validation loss.
 
     Args:
-        settings: preset in configs/training (hip14, all_views, quick, grupp2020), or a YAML file, which may extend
+        settings: preset in configs/training (hip14, usual_views, quick, grupp2020), or a YAML file, which may extend
             one.
         out: folder of this run.
         cases: '[FOLDER, …]', patients to learn from beside the procedural ones: case folders, whose case.yaml names CT,
