@@ -62,8 +62,8 @@ def test_a_record_holds_start_result_and_cost(record: dict[str, Any]) -> None:
     assert record["refused"] is None
     assert set(record["errors"]) >= {"pelvis", "femur", "device", "view2", "view3", "relative_mm", "guide_deg"}
     assert set(record["start_errors"]) == {"pelvis", "femur", "device"}
-    # detections of 3 mm in error: some millimetres across, some centimetres in depth
-    assert 1 < record["start_errors"]["pelvis"]["mm"] < 100
+    # detections of 3 mm in error, mended by outlines: never the truth itself, and up to some centimetres in depth
+    assert 0.1 < record["start_errors"]["pelvis"]["mm"] < 100
     assert record["errors"]["device"] == record["start_errors"]["device"]  # the plan does not move it
     assert 4 <= record["landmarks_used"] <= 14
     assert [stage["name"] for stage in record["stages"]] == ["pelvis"]
