@@ -48,10 +48,10 @@ def detect(
 
     The image is read as it is, turned by 180°, and both again with its grey values inverted, and that reading is kept
     which expects most landmarks; the plain one unless it is exceeded by at least half a landmark, and a turned one only
-    if it expects four (3.5). The network reads
-    either kind of grey values nearly as well, so the rims of the bones that it saw say whether bone is dark. What is
-    kept is then read again with test-time augmentation. Raises `InputError` for an image that does not fit the camera,
-    holds values that are not finite, or is constant. The network computes where it is; what is found lies on the CPU.
+    if it expects four (3.5). The network reads either kind of grey values nearly as well, so the rims of the bones that
+    it saw say whether bone is dark. What is kept is then read again with test-time augmentation. Raises `InputError`
+    for an image that does not fit the camera, holds values that are not finite, or is constant. The network computes
+    where it is; what is found lies on the CPU.
     """
     _check(attenuation, camera)
     image = normalise(to_network_grid(attenuation.to(torch.float32), camera)).to(network.device)

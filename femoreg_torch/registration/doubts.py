@@ -74,8 +74,8 @@ _SURE_OF_BREAK = 4.0
 # label maps too, at most 0.00014; where a leg had moved as a whole 0.0032, with its ends 0.1 mm apart.
 _LEAST_GAIN_OF_BEND = 0.0002
 _GAIN_OF_BREAK, _APART_OF_BREAK_MM = 0.0008, 0.8
-# Of the strength of edges. Smeared by 4 to 8 mm on the detector: 0.80 to 0.93. In images that were not, of five
-# simulators: at least 0.98, where a tenth and more of the image before was left in it 0.95.
+# Of the strength of edges. Smeared by 5 to 8 mm on the detector: 0.80 to 0.94. In 60 that were not, of two
+# simulators: at least 0.98; where a fifth of the image before was left in it 0.95.
 _LEAST_KEPT = 0.955
 
 

@@ -24,7 +24,7 @@ _LEVEL = Level(pixel_mm=1.0, step_mm=1.0)
 _SIGMA_MM = 1.5  # on the detector, of the edges' Gaussian: coarser than noise, finer than a smear that matters
 _AROUND_MM = 6.0  # on the detector, beside what one of the images lacks, and beside what is not exposed
 _CHANGE = 0.15  # of the logarithm of intensity: one of the images lacks what is there
-_LEAST_SHARE = 0.05  # of the exposed part, that can be compared
+_LEAST_SHARE = 0.05  # of the image, that can be compared
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,12 @@ class Smear:
 def smears(scene: Scene, poses: Poses) -> list[Smear]:
     """The images of other kinds than the first, each compared with that of the first kind of its view.
 
-    Views that lack one of the two, or have too little exposed that both show, are left out.
+    Views that lack one of the two, or have too little exposed that both show, or no edges there, are left out.
     """
     others = [kind for kind in scene.images if kind != scene.first_kind]
-    asked = [(kind, view) for kind, view in scene.there(others, range(scene.views))]
     return [
         Smear(kind, view, kept)
-        for kind, view in asked
+        for kind, view in scene.there(others, range(scene.views))
         if scene.there([scene.first_kind], (view,)) and (kept := _kept(scene, poses, kind, view)) is not None
     ]
 
@@ -63,7 +62,7 @@ def _kept(scene: Scene, poses: Poses, kind: Kind, view: int) -> float | None:
     if where.mean() < _LEAST_SHARE:
         return None
     of_first, of_other = (_edges(image, sigma, where) for image in (first, other))
-    if np.linalg.matrix_rank(of_first) < len(of_first):
+    if min(map(np.linalg.matrix_rank, (of_first, of_other))) < len(of_first):
         return None
     least, greatest = linalg.eigvalsh(of_other, of_first)
     return math.sqrt(least / greatest)

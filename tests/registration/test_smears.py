@@ -90,8 +90,11 @@ def test_views_that_lack_an_image_or_show_nothing_are_left_out(scene: Scene) -> 
     lacking = replace(scene, images={**scene.images, "device": (*scene.images["device"][:2], None)})
     assert [each.view for each in smears(lacking, TRUTH)] == [0, 1]
     empty = torch.zeros_like(scene.image("device", 0))
-    blank = with_image(with_image(scene, "anatomy", 0, empty), "device", 0, empty)
-    assert [each.view for each in smears(blank, TRUTH)] == [1, 2]
+    for kinds in (("anatomy", "device"), ("anatomy",), ("device",)):
+        blank = scene
+        for kind in kinds:
+            blank = with_image(blank, kind, 0, empty)
+        assert [each.view for each in smears(blank, TRUTH)] == [1, 2]
 
 
 def test_shutters_that_differ_are_no_smear(scene: Scene) -> None:
