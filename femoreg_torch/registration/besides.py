@@ -20,6 +20,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import natural
 from femoreg_torch.geometry import Camera, Poses, transform_points
 from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.compared import exposed_in_both
 from femoreg_torch.registration.imaging import Imaging, draw
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, stage_objective
@@ -89,11 +90,7 @@ def _look(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Besid
         return None
     camera = poses.camera(view, _LEVEL.camera(scene.carm.camera))
     without, with_it = (_LEVEL.image(image, scene.carm.camera) for image in images)
-    exposed = torch.ones(camera.shape, dtype=torch.bool, device=without.device)
-    for each in (scene.first_kind, kind):
-        field = scene.field(each, view)
-        if field is not None:
-            exposed &= _LEVEL.field(field, scene.carm.camera)
+    exposed = exposed_in_both(scene, (scene.first_kind, kind), view, _LEVEL)
     drawn = draw([scene.objects[name]], poses.camera_from(name)[view][None, None], camera, _LEVEL.step_mm)[0] > 0
     around = dilated(drawn, _AROUND_MM, camera)
     elsewhere = exposed & ~around

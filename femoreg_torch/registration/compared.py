@@ -70,6 +70,15 @@ def exposed_field(scene: Scene, image: tuple[Kind, int], level: Level) -> Tensor
     return None if exposed is None else level.field(exposed, scene.carm.camera)
 
 
+def exposed_in_both(scene: Scene, kinds: tuple[Kind, Kind], view: int, level: Level) -> Tensor:
+    """The pixels (H, W), bool, of a level that the shutters of neither of two images of a view (from 0) touch."""
+    exposed = torch.ones(level.camera(scene.carm.camera).shape, dtype=torch.bool, device=scene.device)
+    for kind in kinds:
+        if (field := exposed_field(scene, (kind, view), level)) is not None:
+            exposed &= field
+    return exposed
+
+
 def prepared(
     scene: Scene,
     image: tuple[Kind, int],

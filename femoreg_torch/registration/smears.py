@@ -15,6 +15,7 @@ from torch import Tensor
 
 from femoreg_torch.fluoro import natural
 from femoreg_torch.geometry import Camera, Poses
+from femoreg_torch.registration.compared import exposed_in_both
 from femoreg_torch.registration.imaging import draw
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.scene import Kind, Scene
@@ -76,11 +77,7 @@ def _shown_by_both(scene: Scene, poses: Poses, kind: Kind, view: int) -> np.ndar
         if (scene.first_kind in scene.objects[name].shown_in) != (kind in scene.objects[name].shown_in)
     ]
     camera = poses.camera(view, _LEVEL.camera(scene.carm.camera))
-    exposed = torch.ones(camera.shape, dtype=torch.bool, device=scene.device)
-    for each in (scene.first_kind, kind):
-        if (field := scene.field(each, view)) is not None:
-            exposed &= _LEVEL.field(field, scene.carm.camera)
-    lacking = ~exposed
+    lacking = ~exposed_in_both(scene, (scene.first_kind, kind), view, _LEVEL)
     if names:
         where = torch.stack([poses.camera_from(name)[view] for name in names])[None]
         lacking |= draw([scene.objects[name] for name in names], where, camera, _LEVEL.step_mm)[0] > 0
