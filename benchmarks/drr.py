@@ -101,7 +101,8 @@ def comparison(volume: Volume, device: str, seconds: float, peer_poses: int) -> 
     if device == "cpu":
         tasks["femoreg"].append(("jacobian", 1))
     for name in RENDERERS:
-        tasks.setdefault(name, [("forward", 1), ("gradient", 1)])
+        if name != "compiled" or device == "cpu":  # for a GPU, torch.compile was still at it after a minute and a half
+            tasks.setdefault(name, [("forward", 1), ("gradient", 1)])
     if peer_poses > 1:
         tasks["nanodrr"].append(("forward", peer_poses))
     rows = []

@@ -11,6 +11,7 @@ TEMPLATE = "femoroplasty"
 PELVIS, FEMUR, DEVICE = "pelvis", "femur", "device"
 ANATOMY_IMAGES, DEVICE_IMAGES = "anatomy", "device"  # kinds of images: without the device, and with it
 DEVICE_POINTS = ("tip", "base", "center")  # guide axis: base → tip; center is where errors are reported
+DEVICE_END = "end"  # optional: where the model ends along its guide, if that is not the tip
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,7 +19,7 @@ class Device:
     """A drilling or injection device. Points (3,) are mm in its own space."""
 
     model: Model
-    points: dict[str, Tensor]  # those of DEVICE_POINTS
+    points: dict[str, Tensor]  # those of DEVICE_POINTS, and DEVICE_END where it is told
     start: Start  # at a nominal pose in camera 1, or beside the femur
 
 

@@ -10,6 +10,7 @@ from femoreg_torch.anatomy.tables import label_ids
 from femoreg_torch.case.femoroplasty import (
     ANATOMY_IMAGES,
     DEVICE,
+    DEVICE_END,
     DEVICE_IMAGES,
     DEVICE_POINTS,
     FEMUR,
@@ -162,12 +163,13 @@ def read_device(device: Fields, folder: Path, path: PlannedPath, side: Side) -> 
 def read_device_points(device: Fields, folder: Path) -> dict[str, Tensor]:
     """The points (3,) of the device, mm in its space: written out, or a file of markups. Raises `InputError`."""
     if isinstance(device.value("points", "{tip, base, center}, or a file of 3D Slicer markups"), str):
-        points = read_landmarks(device.file_path("points", folder), DEVICE_POINTS)
+        points = read_landmarks(device.file_path("points", folder), (*DEVICE_POINTS, DEVICE_END))
         if missing := [name for name in DEVICE_POINTS if name not in points]:
             raise InputError(f"{device.where('points')}: the file lacks {', '.join(missing)}.")
     else:
-        named = device.mapping("points").only(*DEVICE_POINTS)
-        points = {name: named.point(name) for name in DEVICE_POINTS}
+        named = device.mapping("points").only(*DEVICE_POINTS, DEVICE_END)
+        wanted = (*DEVICE_POINTS, DEVICE_END) if DEVICE_END in named else DEVICE_POINTS
+        points = {name: named.point(name) for name in wanted}
     check_guide(points, f"{device.where('points')}.tip")
     return points
 

@@ -12,6 +12,7 @@ from femoreg_torch.anatomy import HIP
 from femoreg_torch.case import Case, femoroplasty_form, read_case
 from femoreg_torch.case.femoroplasty import (
     DEVICE,
+    DEVICE_END,
     DEVICE_POINTS,
     FEMUR,
     PELVIS,
@@ -41,7 +42,7 @@ from femoreg_torch.intake.found import Found, alike_together
 from femoreg_torch.intake.planes import Picture, side_by_side, stacked
 from femoreg_torch.intake.start_picture import picture_of_start
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
-from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM, model_attenuation, told_of_guide
+from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM, model_attenuation, told_of_end, told_of_middle
 from femoreg_torch.volume import is_in_ras, read_ct_told, read_landmarks
 from femoreg_torch.volume.borders import cut_bones
 from femoreg_torch.volume.round_field import round_field
@@ -166,14 +167,14 @@ def _check_device(top: Fields, folder: Path, path: PlannedPath | None, side: Sid
                     "Has the model another unit (inches) or origin than the points?"
                 )
     if volume is not None and "tip" in points and volume.beyond_mm(points["tip"]) <= BEYOND_MM:  # else enough is said
-        found.warnings += told_of_guide("device", volume, points)
+        found.warnings += [*told_of_end("device", volume, points), *told_of_middle("device", volume, points)]
     if {"tip", "base"} <= set(points):
         length = float((points["tip"] - points["base"]).norm())
         if not GUIDE_MM[0] <= length <= GUIDE_MM[1]:
             found.warnings.append(
                 f"device: its tip lies {in_mm(length)} from its base. Is the model in mm? (Inches are 25.4 of them.)"
             )
-    known = path is not None and side is not None and set(points) == set(DEVICE_POINTS)
+    known = path is not None and side is not None and set(points) >= set(DEVICE_POINTS)
     # what a pose in words depends on may be at fault itself: with anything in its place the words are still looked at
     on, along, of = (path, side, points) if known else (_ANY_PATH, "left", _ANY_POINTS)
     start = found.attempt(lambda: femoroplasty_form.read_device_start(device, folder, on, along, of))  # type: ignore[arg-type]
@@ -191,10 +192,11 @@ def _check_device(top: Fields, folder: Path, path: PlannedPath | None, side: Sid
 def _device_points(device: Fields, folder: Path, found: Found) -> dict[str, Tensor]:
     if isinstance(device.content.get("points"), dict):
         named = device.mapping("points")
-        found.unknown_keys(named, DEVICE_POINTS)
-        told = {name: found.attempt(lambda name=name: named.point(name)) for name in DEVICE_POINTS}  # type: ignore[misc]
+        found.unknown_keys(named, (*DEVICE_POINTS, DEVICE_END))
+        wanted = (*DEVICE_POINTS, DEVICE_END) if DEVICE_END in named else DEVICE_POINTS
+        told = {name: found.attempt(lambda name=name: named.point(name)) for name in wanted}  # type: ignore[misc]
         points = {name: point for name, point in told.items() if point is not None}
-        if set(points) != set(DEVICE_POINTS):
+        if set(points) != set(wanted):
             return points
     return found.attempt(lambda: femoroplasty_form.read_device_points(device, folder)) or {}
 
@@ -206,7 +208,8 @@ def _check_written_out(case: Case, found: Found) -> tuple[SeenAnatomy, dict[str,
         if thing.model is not None:
             model = found.attempt(lambda thing=thing: model_attenuation(thing.model))  # type: ignore[misc]
             if model is not None:
-                found.warnings += told_of_guide(thing.name, model.volume, thing.points)
+                found.warnings += told_of_end(thing.name, model.volume, thing.points)
+                found.warnings += told_of_middle(thing.name, model.volume, thing.points)
     if case.ct_path is None or case.labels_path is None:
         return SeenAnatomy(landmarks=case.landmarks, anatomy=case.anatomy), images
     read = found.attempt(lambda: read_ct_told(cast(Path, case.ct_path)))

@@ -11,7 +11,15 @@ import yaml
 from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, LabelTable, label_table, label_table_names
-from femoreg_torch.case.femoroplasty import DEVICE, DEVICE_POINTS, FEMUR, TEMPLATE, femoral_head, operated_femur
+from femoreg_torch.case.femoroplasty import (
+    DEVICE,
+    DEVICE_END,
+    DEVICE_POINTS,
+    FEMUR,
+    TEMPLATE,
+    femoral_head,
+    operated_femur,
+)
 from femoreg_torch.case.model import Intensity, Side
 from femoreg_torch.case.nominal import ALONG_PATH, NominalPlace
 from femoreg_torch.case.reading import CASE_NAME, VERSIONS
@@ -286,7 +294,7 @@ def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
             f"{given.device}: says that it is in RAS, so points and transforms of 3D Slicer do not fit its values. "
             "Export it from 3D Slicer anew, with the coordinate system LPS."
         )
-    points = read_landmarks(given.device_points, DEVICE_POINTS)
+    points = read_landmarks(given.device_points, (*DEVICE_POINTS, DEVICE_END))
     if missing := [name for name in ("tip", "base") if name not in points]:
         raise InputError(f"{given.device_points}: lacks {' and '.join(missing)}. Name the points so in 3D Slicer.")
     if "center" not in points:

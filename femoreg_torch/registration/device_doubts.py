@@ -13,7 +13,7 @@ from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.registration.besides import besides, rival
 from femoreg_torch.registration.calibration import devices
 from femoreg_torch.registration.imaging import Imaging
-from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM
+from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM, model_end, told_of_end
 from femoreg_torch.registration.scene import Kind, Scene, in_view
 from femoreg_torch.registration.sizes import device_size
 from femoreg_torch.registration.tips import TipLength, tip_length
@@ -57,12 +57,13 @@ def doubts_about_units(case: Case, told: Scene, in_doubt: bool) -> tuple[str, ..
 
 
 def doubts_about_told_tips(case: Case, told: Scene) -> tuple[str, ...]:
-    """Guides that run past the end of their model, as they were told, in words."""
-    found = []
+    """Tips that lie before or beyond the end of their model, as they were told, and guides that pass it, in words."""
+    found: list[str] = []
     for name, thing in case.objects.items():
         if thing.model is None or name not in told.objects or not {"base", "tip"} <= set(thing.points):
             continue
-        end = guide_end(told.objects[name].volume, thing.points["base"], thing.points["tip"])
+        found += told_of_end(name, told.objects[name].volume, thing.points)
+        end = guide_end(told.objects[name].volume, thing.points["base"], model_end(thing.points))
         if end is not None and (end.aside_mm > _MOST_ASIDE_MM or end.off_middle_mm > _MOST_OFF_MIDDLE_MM):
             found.append(
                 f"the {name}: the line from its base to its tip passes {end.off_middle_mm:.1f} mm beside the middle of "
@@ -155,7 +156,7 @@ def _tip_elsewhere(
     points = case.objects[name].points
     if not {"base", "tip"} <= set(points):
         return None
-    guide = points["base"], points["tip"]
+    guide = points["base"], model_end(points)
     as_told = replace(scene, objects=scene.objects | {name: told.objects[name]})
     found, if_told = (tip_length(of, poses, name, kind, guide, imaging) for of in (scene, as_told))
     off = [] if found is None or not _ends_elsewhere(found) else [found]

@@ -23,8 +23,9 @@ from femoreg_torch.volume import (
 
 MODEL_SPACING_MM = 0.5  # a sleeve's wall is thinner than a CT voxel
 BEYOND_MM = 25.0  # of a point outside the box of its model: a drill stands out of a sleeve, or the unit is another
-# Of the tip that is told: past the model's end, or from its middle. Of 30 right devices at most 0.4 and 0.1 mm.
-_MOST_OFF_END_MM = 1.0
+# Of the tip that is told: past the model's end or before it, and from that end's middle. Of 30 right devices at most
+# 0.4 and 0.1 mm. A point of 1 mm by 10 mm fills so little of its last voxels that its model seems to end 1 mm earlier.
+_MOST_OFF_END_MM, _MOST_OFF_MIDDLE_MM = 1.5, 1.0
 GUIDE_MM = (20.0, 600.0)  # from base to tip; a model in metres, inches or µm is likely beyond
 
 
@@ -46,23 +47,42 @@ def model_attenuation(model: Model) -> ModelVolumes:
     return ModelVolumes(whole, (whole,))
 
 
-def told_of_guide(name: str, volume: Volume, points: Mapping[str, Tensor]) -> tuple[str, ...]:
-    """In words, a tip that lies elsewhere than where the model of an object ends along its guide.
+def model_end(points: Mapping[str, Tensor]) -> Tensor:
+    """The point (3,) where a model is said to end along its guide: the tip, if no point `end` is told."""
+    return points.get("end", points["tip"])
+
+
+def told_of_end(name: str, volume: Volume, points: Mapping[str, Tensor]) -> tuple[str, ...]:
+    """In words, a tip before or beyond the end of the model of an object along its guide, if no point `end` says so.
 
     It may be meant so: a drill stands out of a sleeve, or cement leaves a needle at its side. A model that was exported
     from another origin looks the same.
     """
-    end = guide_end(volume, points["base"], points["tip"]) if {"base", "tip"} <= set(points) else None
-    off = []
-    if end is not None and abs(end.beyond_mm) > _MOST_OFF_END_MM:
-        off.append(f"{abs(end.beyond_mm):.1f} mm {'beyond' if end.beyond_mm > 0 else 'before'} the end of its model")
-    if end is not None and end.off_middle_mm > _MOST_OFF_END_MM:
-        off.append(f"{end.off_middle_mm:.1f} mm off the middle of that end")
-    if not off:
+    if not {"base", "tip"} <= set(points):
+        return ()
+    end = guide_end(volume, points["base"], model_end(points))
+    if end is None:
+        lies = "far from where its model ends"
+    elif abs(end.beyond_mm) > _MOST_OFF_END_MM:
+        lies = f"{abs(end.beyond_mm):.1f} mm {'beyond' if end.beyond_mm > 0 else 'before'} the end of its model"
+    else:
+        return ()
+    point, meant = "point end", ""
+    if "end" not in points:
+        point, meant = "tip", "; if the tip is meant to lie there, tell the point `end` too, where the model ends"
+    return (
+        f"the {point} of the {name}, as it was told, lies {lies}: check its points and the origin of its model{meant}",
+    )
+
+
+def told_of_middle(name: str, volume: Volume, points: Mapping[str, Tensor]) -> tuple[str, ...]:
+    """In words, a guide that passes beside the middle of the end of its model. It may: a needle's end is slanted."""
+    end = guide_end(volume, points["base"], model_end(points)) if {"base", "tip"} <= set(points) else None
+    if end is None or end.off_middle_mm <= _MOST_OFF_MIDDLE_MM:
         return ()
     return (
-        f"the tip of the {name}, as it was told, lies {' and '.join(off)}: if it is not meant to, check its points and "
-        "the origin of its model",
+        f"the guide of the {name}, as it was told, passes {end.off_middle_mm:.1f} mm beside the middle of its model's "
+        "end: if it is not meant to, check its points and the origin of its model",
     )
 
 

@@ -33,7 +33,7 @@ from femoreg_torch.fluoro import (
     without_defects,
     without_penumbra,
 )
-from femoreg_torch.registration.models import ModelVolumes, model_attenuation, told_of_guide
+from femoreg_torch.registration.models import ModelVolumes, model_attenuation, told_of_middle
 from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.registration.silhouette import outline_of
@@ -92,7 +92,7 @@ def prepare_scene(case: Case) -> Scene:
     for name, (volumes, axis) in made.items():
         thing = case.objects[name]
         assert thing.model is not None
-        told = (*told, *told_of_guide(name, volumes.volume, thing.points))
+        told = (*told, *told_of_middle(name, volumes.volume, thing.points))
         objects[name] = RigidObject(
             volumes.volume,
             volumes.volume.centre() if thing.reference is None else thing.reference,

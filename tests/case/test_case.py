@@ -27,9 +27,9 @@ def example(folder: Path) -> Case:
     """A case with two views and everything that is optional; its files are there but empty."""
     for name in FILES:
         (folder / name).write_bytes(b"some")
-    points = torch.randn(18, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 100
+    points = torch.randn(19, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 100
     landmarks = dict(zip(HIP.landmark_names, points, strict=False))
-    device_points = dict(zip(("tip", "base", "center"), points[15:], strict=True))
+    device_points = dict(zip(("tip", "base", "center", "end"), points[15:], strict=True))
     device = Device(Model(folder / "device.stl", 5000.0), device_points, Start(camera1_from=pose(1)))
     return Case(
         folder=folder,

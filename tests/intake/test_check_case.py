@@ -356,6 +356,26 @@ def test_a_point_beside_the_model_is_told(files: Path, tmp_path: Path, unit: flo
     assert len(warnings) == told, warnings
 
 
+@pytest.mark.parametrize(
+    ("points", "told"),
+    [({"tip": [0, 0, -75]}, None), ({"tip": [0, 0, -63]}, "before"), ({"tip": [0, 0, -63], "end": [0, 0, -75]}, None)],
+)
+def test_a_tip_that_is_no_end_of_its_model_is_told(
+    files: Path, tmp_path: Path, points: dict[str, list[int]], told: str | None
+) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    trimesh.creation.cylinder(radius=2, height=150, sections=12).export(folder / "device.stl")
+    content = case_content()
+    content["device"]["points"] = {"base": [0, 0, 50], "center": [0, 0, 0], **points}
+    write_content(folder, content)
+    found = check_case(folder, find_start=False)
+    assert not found.problems
+    warnings = [each for each in found.warnings if "the end of its model" in each]
+    assert len(warnings) == (told is not None), warnings
+    assert told is None or f"12.0 mm {told} the end" in warnings[0]
+
+
 @pytest.mark.parametrize(("order", "told"), [((1, 2, 3), 0), ((1, 3, 2), 2), ((2, 3, 1), 3)])
 def test_exchanged_images_are_told(files: Path, tmp_path: Path, order: tuple[int, ...], told: int) -> None:
     """Each view shows lumps of its own; the images with the device show them darker, with a bar across."""

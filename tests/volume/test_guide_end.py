@@ -1,11 +1,13 @@
 """Where a model ends along its guide, of shapes whose ends are known."""
 
+import math
+
 import pytest
 import torch
 import trimesh
 from torch import Tensor
 
-from femoreg_torch.registration.models import told_of_guide
+from femoreg_torch.registration.models import told_of_end, told_of_middle
 from femoreg_torch.volume import Volume, guide_end, voxelise_mesh
 
 TIP, BASE = torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 100.0], dtype=torch.float64)
@@ -26,11 +28,33 @@ def test_a_right_tip_lies_at_the_end_of_the_model() -> None:
     assert end.beyond_mm == pytest.approx(0, abs=0.5)
     assert end.off_middle_mm < 0.1
     assert end.aside_mm == 0
-    assert told_of_guide("device", voxels(needle()), {"tip": TIP, "base": BASE}) == ()
+    assert told_of_end("device", voxels(needle()), {"tip": TIP, "base": BASE}) == ()
+    assert told_of_middle("device", voxels(needle()), {"tip": TIP, "base": BASE}) == ()
+
+
+def test_a_thin_point_is_the_end_of_its_model() -> None:
+    """Of a wire of 1 mm: the last voxels hold next to nothing of it."""
+    wire = trimesh.creation.cylinder(0.5, segment=[[0, 0, 10], [0, 0, 100]])
+    point = trimesh.creation.cone(0.5, 10, transform=trimesh.transformations.rotation_matrix(math.pi, [1, 0, 0]))
+    point.apply_translation([0, 0, 10])
+    assert point.bounds[0, 2] == pytest.approx(0)
+    assert told_of_end("device", voxels(wire, point), {"tip": TIP, "base": BASE}) == ()
+
+
+def test_a_point_tells_where_the_model_ends_if_the_tip_does_not() -> None:
+    inside = {"tip": TIP + 0.12 * BASE, "base": BASE}
+    (told,) = told_of_end("device", voxels(needle()), inside)
+    assert "tell the point `end` too" in told
+    assert told_of_end("device", voxels(needle()), {**inside, "end": TIP}) == ()
+    (told,) = told_of_end("device", voxels(needle()), {**inside, "end": TIP - 0.05 * BASE})
+    assert "the point end of the device" in told
+    assert "beyond the end of its model" in told
+    (told,) = told_of_end("device", voxels(needle()), {"tip": TIP - 0.5 * BASE, "base": BASE})
+    assert "far from where its model ends" in told
 
 
 @pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [0.6, -0.64, 0.48]])
-@pytest.mark.parametrize(("along", "across"), [(3.0, 0.0), (-4.0, 0.0), (0.0, 3.0), (2.0, 4.0)])
+@pytest.mark.parametrize(("along", "across"), [(3.0, 0.0), (-4.0, 0.0), (0.0, 3.0), (2.5, 4.0)])
 def test_another_origin_is_told_by_as_much(direction: list[float], along: float, across: float) -> None:
     axis = torch.tensor(direction, dtype=torch.float64)
     aside = torch.linalg.cross(axis, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
@@ -40,8 +64,9 @@ def test_another_origin_is_told_by_as_much(direction: list[float], along: float,
     assert end.beyond_mm == pytest.approx(along, abs=0.8)  # partly filled voxels count
     assert end.off_middle_mm == pytest.approx(across, abs=0.15)
     assert end.aside_mm == pytest.approx(max(0, across - 2), abs=0.5)
-    (told,) = told_of_guide("device", voxels(needle(2.0, 100 * axis)), {"tip": TIP + shift, "base": 100 * axis + shift})
-    assert ("the end of its model" in told, "off the middle" in told) == (along != 0, across != 0)
+    points = {"tip": TIP + shift, "base": 100 * axis + shift}
+    assert len(told_of_end("device", voxels(needle(2.0, 100 * axis)), points)) == (along != 0)
+    assert len(told_of_middle("device", voxels(needle(2.0, 100 * axis)), points)) == (across != 0)
 
 
 def test_what_stands_beside_a_guide_is_no_end_of_it() -> None:
