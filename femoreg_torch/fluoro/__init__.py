@@ -1,6 +1,6 @@
 """Fluoroscopic images: files, display, the exposed field, attenuation, distortion and coarser grids."""
 
-from femoreg_torch.fluoro.collimation import Shutter, exposed_field, find_shutter, without_penumbra
+from femoreg_torch.fluoro.collimation import Shutter, exposed_field, find_shutter, shades, without_penumbra
 from femoreg_torch.fluoro.defects import without_defects
 from femoreg_torch.fluoro.dicom import Frames, carm_settings, read_header
 from femoreg_torch.fluoro.display import SOURCES, TURNS, Display, Source, nearest_source
@@ -64,6 +64,7 @@ __all__ = [
     "read_stored",
     "saturated",
     "settled_intensity",
+    "shades",
     "without_defects",
     "without_penumbra",
     "write_image",

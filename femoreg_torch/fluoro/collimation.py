@@ -7,7 +7,7 @@ of the image: what leaves only its side is the skin of a flat body, which is nea
 Everything is fitted on pixels of about 1 mm, in mm on the detector.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -53,6 +53,7 @@ class Shutter:
     shape: str  # in words
     exposed: float  # share of the detector
     field: Tensor  # (H, W) bool: the pixels inside, without the penumbra
+    sides: tuple["_Circle | _Line", ...]  # of its edge, in mm on the detector
 
 
 def exposed_field(raw: Tensor, camera: Camera) -> Tensor | None:
@@ -73,9 +74,7 @@ def without_penumbra(exposed: Tensor, camera: Camera) -> Tensor:
 
 def find_shutter(raw: Tensor, camera: Camera) -> Shutter | None:
     """The shutter in a raw image (H, W), bone dark; None where there is none."""
-    factor = max(1, round(_PIXEL_MM / camera.mean_pixel_mm))
-    image = cv2.medianBlur(downsample(raw, factor).clamp_min(0).numpy(), 3).astype(np.float64)
-    grid = _Grid(image.shape, (camera.pixel_mm[1] * factor, camera.pixel_mm[0] * factor))
+    image, grid = _coarse(raw, camera)
     best = None
     for level in _levels(image):
         fit = _fit(image, level, grid)
@@ -92,7 +91,29 @@ def find_shutter(raw: Tensor, camera: Camera) -> Shutter | None:
     y = (rows + 0.5) * camera.pixel_mm[0] - 0.5 * grid.pixel_mm[1]
     places = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2).numpy()
     exposed = torch.from_numpy(best.inside(places)).reshape(raw.shape)
-    return Shutter(best.name, float(exposed.double().mean()), without_penumbra(exposed, camera))
+    return Shutter(best.name, float(exposed.double().mean()), without_penumbra(exposed, camera), tuple(best.sides))
+
+
+def shades(shutter: Shutter, raw: Tensor, camera: Camera) -> bool:
+    """Whether a shutter that was found in another image of the camera shades a raw image (H, W), bone dark, too.
+
+    Then the image drops as sharply along its edge as `find_shutter` asks. No grey value need part shadow and field:
+    beside air, scattered light makes a shadow brighter than a thick body is.
+    """
+    image, grid = _coarse(raw, camera)
+    sharp = total = 0
+    for side in shutter.sides:
+        places = _edge(side, shutter.sides, grid)
+        kept, known = _sharp_edge(image, places, side.outwards(places), grid)
+        sharp, total = sharp + len(kept), total + known
+    return total > 0 and sharp >= _LEAST_SHARP * total
+
+
+def _coarse(raw: Tensor, camera: Camera) -> "tuple[Array, _Grid]":
+    """A raw image on the pixels that edges are looked for on."""
+    factor = max(1, round(_PIXEL_MM / camera.mean_pixel_mm))
+    image = cv2.medianBlur(downsample(raw, factor).clamp_min(0).numpy(), 3).astype(np.float64)
+    return image, _Grid(image.shape, (camera.pixel_mm[1] * factor, camera.pixel_mm[0] * factor))
 
 
 @dataclass(frozen=True)
@@ -223,9 +244,7 @@ def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
     sharp = total = 0
     seen = set()
     for side in sides:
-        places = side.edge(grid.edge_mm, grid)
-        here = np.all([other.depth(places) >= -grid.edge_mm for other in sides if other is not side], axis=0)
-        places = places[grid.within(places) & here]
+        places = _edge(side, sides, grid)
         kept, known = _sharp_edge(image, places, side.outwards(places), grid)
         if len(kept) < 8:
             continue  # bones, where a grey value is taken that lies within them
@@ -245,6 +264,13 @@ def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
         return None
     fit = _Fit(refined, sharp / total)
     return fit if fit.inside(grid.middle[None]).all() else None
+
+
+def _edge(side: _Circle | _Line, sides: Sequence[_Circle | _Line], grid: _Grid) -> Array:
+    """Places (N, 2) along a side, on the detector, where the other sides leave it."""
+    places = side.edge(grid.edge_mm, grid)
+    here = np.all([other.depth(places) >= -grid.edge_mm for other in sides if other is not side], axis=0)
+    return np.asarray(places[grid.within(places) & here])
 
 
 def _with_other_blades(fit: _Fit, image: Array, grid: _Grid) -> _Fit:

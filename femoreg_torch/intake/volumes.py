@@ -16,7 +16,6 @@ _COARSE_MM, _COARSE_STEP_MM = 1.5, 3.0  # the registration takes voxels of 1 mm
 _SOFT_HU, _BONE_HU, _METAL_HU = -50.0, 300.0, 2800.0
 _LEAST_AIR = 0.005  # share of the voxels; beside every patient there is some
 _METAL_ML = 1.0
-_DISAGREE_MM = 0.5
 _SPACES_WITHOUT_A_PATIENT = tuple(
     name + time for name in (b"scanner-xyz", b"3d-right-handed", b"3d-left-handed") for time in (b"", b"-time")
 )  # NRRD format, section 5.1
@@ -94,14 +93,8 @@ def header_warnings(path: Path) -> list[str]:
         ]
     if min(codes) == 0:
         return []
-    size = np.array([*header.get_data_shape()[:3], 2]) - 1
-    corners = np.array([[size[k] * (n >> k & 1) for k in range(3)] + [1] for n in range(8)])
     try:
-        apart = float(np.linalg.norm((corners @ (header.get_sform() - header.get_qform()).T), axis=1).max())
+        header.get_qform()
     except ValueError:  # a quaternion that is none
         return ["the qform of the NIfTI header is damaged, its sform was taken; other programs may take the first"]
-    if not apart < np.inf or apart > _DISAGREE_MM:
-        return [
-            f"sform and qform of the NIfTI header disagree by up to {apart:.1f} mm; programs differ in which they take"
-        ]
     return []

@@ -16,6 +16,7 @@ from femoreg_torch.fluoro import (
     Circle,
     Distortion,
     Polygon,
+    Shutter,
     StoredImage,
     attenuation_image,
     below_zero,
@@ -30,6 +31,7 @@ from femoreg_torch.fluoro import (
     read_stored,
     saturated,
     settled_intensity,
+    shades,
     without_defects,
     without_penumbra,
 )
@@ -235,8 +237,7 @@ def read_images(case: Case) -> tuple[ByKind, ByKind, tuple[str, ...]]:
     A field is None where the whole detector is exposed. Last, in words, which images are missing, and which shutters
     were found. Raises `InputError` if a view lacks an image of the first kind.
     """
-    images: ByKind = {}
-    fields: ByKind = {}
+    found: dict[Kind, list[_Image | None]] = {}
     told = []
     wanted = dict.fromkeys((*case.kinds, *(kind for thing in case.objects.values() for kind in thing.images or ())))
     for kind in wanted:
@@ -244,14 +245,21 @@ def read_images(case: Case) -> tuple[ByKind, ByKind, tuple[str, ...]]:
         if without and kind == case.kinds[0]:
             raise InputError(f"{case.folder}/case.yaml, views[{without[0] - 1}].{kind}: missing.")
         if len(without) < len(case.views):
-            read = [_read_image(case, i, kind) if kind in view.images else None for i, view in enumerate(case.views)]
-            images[kind] = tuple(None if one is None else one.attenuation for one in read)
-            fields[kind] = tuple(None if one is None else one.field for one in read)
-            told += [remark for one in read if one is not None for remark in one.told]
+            found[kind] = [
+                _read_image(case, i, kind) if kind in view.images else None for i, view in enumerate(case.views)
+            ]
         if without:
             told.append(_told(case, kind, without))
+    shutters = [one.shutter for read in found.values() for one in read if one is not None and one.shutter is not None]
+    for kind, read in found.items():
+        for index, one in enumerate(read):
+            if one is not None and one.field is None and shutters:
+                read[index] = _read_image(case, index, kind, shutters)
+    images = {kind: tuple(None if one is None else one.attenuation for one in read) for kind, read in found.items()}
+    fields = {kind: tuple(None if one is None else one.field for one in read) for kind, read in found.items()}
     _check_different(case, images)
-    return images, fields, tuple(told)
+    remarks = [remark for read in found.values() for one in read if one is not None for remark in one.told]
+    return images, fields, (*remarks, *told)
 
 
 def _read_with_saturated(case: Case) -> tuple[ByKind, ByKind, ByKind, tuple[str, ...]]:
@@ -321,9 +329,10 @@ class _Image:
     attenuation: Tensor  # (H, W)
     field: Tensor | None  # (H, W) bool: what is exposed; None: all
     told: tuple[str, ...]  # of a shutter that was found, and of the file, in words
+    shutter: Shutter | None  # that was found
 
 
-def _read_image(case: Case, index: int, kind: Kind) -> _Image:
+def _read_image(case: Case, index: int, kind: Kind, shutters: Sequence[Shutter] = ()) -> _Image:
     """One image of a view (from 0) as the source sees it, and its field: see `_field`."""
     view, display, camera = case.views[index], case.display_of(index), case.carm.camera
     where, told = f"{case.folder}/case.yaml, views[{index}].{kind}", f"view {index + 1}, {kind} image: "
@@ -342,7 +351,7 @@ def _read_image(case: Case, index: int, kind: Kind) -> _Image:
     raw = intensity_of(image) if logarithms else image
     if not logarithms:
         check_intensity(raw, file)
-    field, shutter = _field(case, index, stored, raw, distortion)
+    field, words, shutter = _field(case, index, stored, raw, distortion, shutters)
     if field is not None and not field.any():
         told_by = f"{case.folder}/case.yaml, views[{index}].field" if view.field is not None else f"{where}: its header"
         raise InputError(f"{told_by}: exposes no pixel of the image.")
@@ -351,11 +360,10 @@ def _read_image(case: Case, index: int, kind: Kind) -> _Image:
     remarks = (
         *bent,
         *(f"{view.images[kind].name} {remark}" for remark in (*stored.remarks, *filter(None, [dark, mended]))),
-        *([shutter] if shutter else []),
+        *([words] if words else []),
     )
-    return _Image(
-        image if logarithms else attenuation_image(image, field), field, tuple(told + remark for remark in remarks)
-    )
+    attenuation = image if logarithms else attenuation_image(image, field)
+    return _Image(attenuation, field, tuple(told + remark for remark in remarks), shutter)
 
 
 def view_distortion(case: Case, index: int) -> Distortion | None:
@@ -377,12 +385,18 @@ def _told_distortion(found: Distortion) -> str:
 
 
 def _field(
-    case: Case, index: int, stored: StoredImage, raw: Tensor, distortion: Distortion | None
-) -> tuple[Tensor | None, str | None]:
+    case: Case,
+    index: int,
+    stored: StoredImage,
+    raw: Tensor,
+    distortion: Distortion | None,
+    shutters: Sequence[Shutter],
+) -> tuple[Tensor | None, str | None, Shutter | None]:
     """The exposed pixels (H, W) of an image `raw` of a view (from 0), None for all, and where they come from, in words.
 
     The field is what the case tells, or else what the header's shutter leaves, or else what a shutter in the image
-    leaves, or rows and columns without an image; pixels that hold no image are never exposed.
+    leaves, or one of the `shutters` of other images that this one shows too, or rows and columns without an image;
+    pixels that hold no image are never exposed. Last, the shutter that was found in the image.
     """
     camera, display, told = case.carm.camera, case.display_of(index), case.views[index].field
     field, words = None, None
@@ -399,16 +413,16 @@ def _field(
         image = ~seen(stored.padding)
         field = image if field is None else field & image
     if field is not None:
-        return without_penumbra(field, camera), words
-    shutter = find_shutter(raw, camera)
+        return without_penumbra(field, camera), words, None
+    shutter = find_shutter(raw, camera) or next((one for one in shutters if shades(one, raw, camera)), None)
     if shutter is None:
         blank = blank_lines(raw)
         if blank is None:
-            return None, None
+            return None, None, None
         words = f"{100 * float(blank.double().mean()):.0f} % of it, whole rows or columns, hold no image"
-        return without_penumbra(~blank, camera), words
+        return without_penumbra(~blank, camera), words, None
     words = f"a {shutter.shape} shutter was found, {100 * shutter.exposed:.0f} % of the detector is exposed"
-    return shutter.field, words
+    return shutter.field, words, shutter
 
 
 def _told_field(case: Case, index: int, field: Circle | Polygon | Path) -> Tensor:

@@ -1,6 +1,7 @@
-"""What SimpleITK's reader of NIfTI passes over: values that are not finite, files that are cut off or not compressed.
+"""What SimpleITK's reader of NIfTI passes over: values that are not finite, damage, and two places in one header.
 
-It turns the first into zero, which as HU would be water, and fills the second up with zeros.
+It turns values that are not finite into zero, which as HU would be water, and fills up with zeros what is cut off. Of
+places that contradict one another it takes one, other programs the other.
 """
 
 import gzip
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     import nibabel
 
 _SAME_SIZE = 0.01  # voxels, of what rounding may make of them
+_SAME_PLACE_MM = 0.5  # of any voxel, by what stands twice in a header
 _BEYOND = 2**20  # bytes that are decompressed after the last voxel, to come to the end of the file
 NIFTI_SUFFIXES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz")
 
@@ -37,7 +39,10 @@ def check_nifti(path: Path) -> None:
             there = None if path.name.lower().endswith((".hdr", ".img", ".img.gz")) else path.stat().st_size
             if not np.isfinite(image.affine).all():
                 raise InputError(f"{path}: its origin or its axes are not finite. Export it anew.")
-            _check_sizes(path, image)
+            stored = _as_stored(path, image)
+            _check_sizes(path, image, stored)
+            _check_places(path, image)
+            _check_scale(path, stored)
             check_claim(path, image.shape, kind.itemsize, there)
             # Integers are all finite. To decompress them only to see that none is missing would double the time to
             # read.
@@ -72,14 +77,59 @@ def _check_kind(path: Path, image: Any) -> None:
         )
 
 
-def _check_sizes(path: Path, image: Any) -> None:
+def _as_stored(path: Path, image: Any) -> Any:
+    """The header (nibabel's) as it stands in the file: nibabel mends what it finds wrong, ITK takes it as it is."""
+    kind = type(image.header)
+    source = path.with_name(path.name[: -len(".img.gz")] + ".hdr.gz") if path.name.lower().endswith(".img.gz") else path
+    source = source.with_suffix(".hdr") if source.suffix.lower() == ".img" else source
+    with gzip.open(source) if source.suffix.lower() == ".gz" else opened(source) as file:
+        return kind(file.read(kind.template_dtype.itemsize), endianness=image.header.endianness, check=False)
+
+
+def _check_sizes(path: Path, image: Any, stored: Any) -> None:
     """Raises `InputError` where voxels have another size by `pixdim` than by the axes; programs differ in choice."""
     sized = [n for n, count in enumerate(image.shape[:3]) if count > 1]
-    told = np.abs(np.array(image.header.get_zooms(), float)[sized])
+    told = np.array(stored["pixdim"][1:4], float)[sized]
+    if (told < 0).any():
+        raise InputError(
+            f"{path}: its header tells a negative size of voxels (pixdim {told.min():.4g}); programs differ in what "
+            "they make of it. Export it anew."
+        )
     axes = np.linalg.norm(image.affine[:3, :3], axis=0)[sized]
-    if not np.allclose(told, axes, rtol=_SAME_SIZE):
+    apart = np.abs(told - axes) * np.array(image.shape)[sized]
+    if not np.allclose(told, axes, rtol=_SAME_SIZE) or np.linalg.norm(apart) > _SAME_PLACE_MM:
         by = " and ".join(" × ".join(f"{mm:.4g}" for mm in sizes) for sizes in (told, axes))
         raise InputError(f"{path}: its header tells voxels of {by} mm, by pixdim and by its axes. Export it anew.")
+
+
+def _check_places(path: Path, image: Any) -> None:
+    """Raises `InputError` where sform and qform put the voxels to different places; programs differ in choice."""
+    header = image.header
+    if not (int(header["sform_code"]) and int(header["qform_code"])):
+        return
+    try:
+        between = header.get_sform() - header.get_qform()
+    except ValueError:  # a quaternion that is none, so that the sform counts
+        return
+    size = np.array([*image.shape[:3], 2]) - 1
+    corners = np.array([[size[k] * (n >> k & 1) for k in range(3)] + [1] for n in range(8)])
+    apart = float(np.linalg.norm((corners @ between.T)[:, :3], axis=1).max())
+    if not apart <= _SAME_PLACE_MM:
+        raise InputError(
+            f"{path}: sform and qform of its header disagree by up to {apart:.1f} mm, and programs differ in which "
+            "they take. Keep the one that landmarks, labels and plan were made with; in Python: x = nibabel.load(…); "
+            "x.set_qform(x.get_sform(), 1), or x.set_sform(x.get_qform(), 1); nibabel.save(x, …)."
+        )
+
+
+def _check_scale(path: Path, stored: Any) -> None:
+    """Raises `InputError` for an offset of values whose factor is zero: by the standard there is none, ITK adds it."""
+    factor, offset = float(stored["scl_slope"]), float(stored["scl_inter"])
+    if factor == 0 and np.isfinite(offset) and offset != 0:
+        raise InputError(
+            f"{path}: its header tells values to be scaled by 0 and {offset:g} to be added (scl_slope, scl_inter); "
+            "programs differ in whether they add it. Export it anew."
+        )
 
 
 def _whole(path: Path, data: "nibabel.arrayproxy.ArrayProxy") -> bool:

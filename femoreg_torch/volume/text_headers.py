@@ -138,9 +138,25 @@ def _of_meta_image(beginning: bytes, path: Path) -> _Values:
     if source.lower() == "local":
         if skipped > 0:
             raise InputError(f"{path}: `HeaderSize` in its header is for values in another file. Export it anew.")
+        if compressed:
+            _check_compressed_size(fields, path, path.stat().st_size - last.end())
         return _Values(path, last.end(), claimed, compressed)
     there = _file_of_values(source, path)
     return _Values(there, there.stat().st_size - claimed if skipped < 0 else skipped, claimed, compressed)
+
+
+def _check_compressed_size(fields: Mapping[str, str], path: Path, there: int) -> None:
+    """Raises `InputError` unless a header tells how many compressed bytes follow it: ITK needs it, and does not say so.
+
+    Without it, it returns memory that nothing was written to.
+    """
+    told = fields.get("CompressedDataSize", "")
+    if told.strip() != str(there):
+        found = f"says {shortened(told, 40)}" if told else "is missing"
+        raise InputError(
+            f"{path}: {there} bytes of compressed values follow its header, where `CompressedDataSize` {found}: it is "
+            "damaged, or its values cannot be told. Save it anew, with 3D Slicer, say."
+        )
 
 
 def _of_nrrd(beginning: bytes, path: Path) -> _Values:

@@ -9,7 +9,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from femoreg_torch.fluoro import Circle, Polygon, attenuation_image, exposed_field, find_shutter, without_penumbra
+from femoreg_torch.fluoro import (
+    Circle,
+    Polygon,
+    attenuation_image,
+    exposed_field,
+    find_shutter,
+    shades,
+    without_penumbra,
+)
 from femoreg_torch.geometry import centred_camera
 
 CAMERA = centred_camera(1020.0, (0.776, 0.776), (384, 384))
@@ -90,6 +98,20 @@ def test_blades_beside_a_bright_field_are_found_though_scattered_light_fills_the
     found = find_shutter(torch.poisson(light, generator=torch.Generator().manual_seed(1)), CAMERA)
     assert found is not None
     assert overlap(found.field, without_penumbra(exposed, CAMERA)) > 0.98
+
+
+def test_a_shutter_of_another_image_is_found_where_a_thick_body_is_darker_than_its_shadow() -> None:
+    """Light scattered beside a strip of air fills the shadow."""
+    exposed = Circle((191, 191), 150).exposed((SIZE, SIZE))
+    shutter = find_shutter(shaded(anatomy(1), exposed), CAMERA)
+    assert shutter is not None
+    light = smooth(exposed.float(), 0.9) * torch.where(COLUMN < 90, 60000.0, 3000 * torch.exp(-3 * COLUMN / SIZE))
+    light = light + 0.03 * 60000 * torch.exp(-(((ROW - 191) / 150) ** 2 + (COLUMN / 110) ** 2) / 2)
+    image = torch.poisson(light, generator=torch.Generator().manual_seed(1))
+    assert find_shutter(image, CAMERA) is None
+    assert shades(shutter, image, CAMERA)
+    for other in (anatomy(2), anatomy(3, 0.0), dense_at_the_border(), shaded(anatomy(2), FIELDS["rectangle"][0])):
+        assert not shades(shutter, other, CAMERA)
 
 
 def test_instruments_may_cross_the_edge_and_lie_inside() -> None:

@@ -12,10 +12,10 @@ from torch import Tensor
 from femoreg_torch.case import Case, CaseObject, View
 from femoreg_torch.detect import Detection, filled
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import Circle, Polygon, without_penumbra, write_image
+from femoreg_torch.fluoro import Circle, Polygon, find_shutter, without_penumbra, write_image
 from femoreg_torch.geometry import Camera
 from femoreg_torch.optimize import LevenbergMarquardt
-from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Scene, Stage
+from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Scene, Stage, prepare
 from femoreg_torch.registration.covariance import pose_covariance
 from femoreg_torch.registration.objective import image_costs, stage_objective
 from femoreg_torch.registration.prepare import read_images
@@ -157,6 +157,24 @@ def case_with(folder: Path, raw: Tensor, **told: object) -> Case:
     write_image(folder / "view1.tif", raw.to(torch.uint16))
     views = (View({"anatomy": folder / "view1.tif"}, **told),)  # type: ignore[arg-type]
     return Case(folder, CARM, {"bone": CaseObject("bone")}, views)
+
+
+def test_a_shutter_that_one_image_hides_is_known_from_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    beam = 30000 * torch.exp(-torch.rand(88, 88, generator=torch.Generator().manual_seed(0)) / 3)
+    case = case_with(tmp_path, torch.where(FIELD, beam, 60.0))
+    write_image(tmp_path / "view2.tif", torch.where(FIELD, beam.flip(0), 60.0).to(torch.uint16))
+    case = replace(case, views=(*case.views, View({"anatomy": tmp_path / "view2.tif"})))
+    found = iter([find_shutter(torch.where(FIELD, beam, 60.0), CARM.camera), None, None])
+    monkeypatch.setattr(prepare, "find_shutter", lambda raw, camera: next(found))
+    _, fields, told = read_images(case)
+    first, second = fields["anatomy"]
+    assert first is not None
+    assert second is not None
+    assert torch.equal(first, second)
+    assert len(told) == 2
+    write_image(tmp_path / "view2.tif", beam.flip(0).to(torch.uint16))
+    found = iter([find_shutter(torch.where(FIELD, beam, 60.0), CARM.camera), None, None])
+    assert read_images(case)[1]["anatomy"][1] is None  # its shutter was open
 
 
 def test_a_field_is_found_or_told_by_the_case(tmp_path: Path) -> None:

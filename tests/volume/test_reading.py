@@ -1,6 +1,7 @@
 """Volumes from files against SimpleITK's own index-to-point transform, and every way in which a file can be wrong."""
 
 import gzip
+import struct
 from pathlib import Path
 
 import nibabel
@@ -270,6 +271,43 @@ def test_a_nifti_whose_voxels_have_two_sizes_is_refused(axis: int, size: float, 
     (tmp_path / "ct.nii").write_bytes(bytes(content))
     with pytest.raises(InputError, match=r"ct\.nii: its header tells voxels of"):
         read_volume(tmp_path / "ct.nii")
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "says"),
+    [
+        (80, -1.0, "a negative size of voxels"),  # pixdim[1]
+        (80, 1.004, None),  # of few voxels: a hundredth of a millimetre
+        (116, -1024.0, "scaled by 0 and -1024 to be added"),  # scl_inter; scl_slope is 0
+    ],
+)
+def test_headers_of_nifti_that_programs_read_in_two_ways(
+    tmp_path: Path, place: int, value: float, says: str | None
+) -> None:
+    path = tmp_path / "ct.nii"
+    nibabel.save(nibabel.Nifti1Image(np.zeros((5, 5, 5), np.int16), np.diag([-1.0, -1.0, 1.0, 1.0])), path)
+    content = bytearray(path.read_bytes())
+    content[112:120] = struct.pack("<2f", 0, 0)
+    content[place : place + 4] = struct.pack("<f", value)
+    path.write_bytes(content)
+    if says is None:
+        read_volume(path)
+        return
+    with pytest.raises(InputError, match=says):
+        read_volume(path)
+    (tmp_path / "packed.nii.gz").write_bytes(gzip.compress(bytes(content)))
+    with pytest.raises(InputError, match=says):
+        read_volume(tmp_path / "packed.nii.gz")
+
+
+def test_a_small_error_of_the_size_of_voxels_adds_up(tmp_path: Path) -> None:
+    path = tmp_path / "ct.nii"
+    nibabel.save(nibabel.Nifti1Image(np.zeros((200, 5, 5), np.int16), np.diag([-1.0, -1.0, 1.0, 1.0])), path)
+    content = bytearray(path.read_bytes())
+    content[80:84] = struct.pack("<f", 1.004)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"its header tells voxels of 1\.004"):
+        read_volume(path)
 
 
 @pytest.mark.parametrize("dtype", ["int16", "float32"])

@@ -1,5 +1,6 @@
 """MetaImage and NRRD files that ITK crashes on, or reads wrongly, never reach it."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -112,6 +113,16 @@ def test_one_bit_of_compressed_values(name: str, tmp_path: Path) -> None:
             read_itk(path)
     path.write_bytes(content[:-200])
     with pytest.raises(InputError, match="damaged"):
+        read_itk(path)
+
+
+@pytest.mark.parametrize("becomes", [b"", b"CompressedDataSize = 10"])
+def test_compressed_values_whose_size_is_not_told(tmp_path: Path, becomes: bytes) -> None:
+    """ITK returns memory that nothing was written to."""
+    path = written(tmp_path / "a.mha", compressed=True)
+    content = path.read_bytes()
+    path.write_bytes(re.sub(rb"CompressedDataSize = [0-9]+" + (b"" if becomes else b"\n"), becomes, content, count=1))
+    with pytest.raises(InputError, match="bytes of compressed values follow its header"):
         read_itk(path)
 
 
