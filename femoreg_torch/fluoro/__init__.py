@@ -14,6 +14,7 @@ from femoreg_torch.fluoro.intensity import (
     downsample,
     intensity_of,
     natural,
+    raised,
 )
 from femoreg_torch.fluoro.reading import (
     StoredImage,
@@ -59,6 +60,7 @@ __all__ = [
     "natural",
     "nearest_side",
     "nearest_source",
+    "raised",
     "read_header",
     "read_image",
     "read_stored",

@@ -13,6 +13,7 @@ _MOST_ATTENUATION = 12.0  # of a patient: 45 cm of water at 60 keV are 9
 _EXTREME = 60.0  # attenuation of which float32 can still take the intensity
 _USUAL_RANGE = 8.0  # of attenuation in an image of a hip
 _MOST_BELOW_ZERO = 0.01  # share of pixels; noise of a dark detector leaves fewer where a patient lies
+_RAISED = 0.5  # of the greatest value: a hip leaves a hundredth of the open beam, a hand a third
 _SPARSE = 8  # every so many-th pixel tells what half of an image is
 _SIGMA_PX = math.sqrt(2.0)  # of the smoothing that finds I0: variance 2 px², as xReg does (itkIntensLogTrans)
 
@@ -56,6 +57,14 @@ def check_intensity(raw: Tensor, where: str) -> None:
     """Raises `InputError` that starts with `where` if no pixel of a raw image is positive."""
     if not raw.max() > 0:
         raise InputError(f"{where}: no pixel is positive, a raw intensity image was expected. Is its intensity `log`?")
+
+
+def raised(raw: Tensor) -> str | None:
+    """In words, an offset that seems to have been added to all values of a raw image: nothing in it is near black."""
+    low, high = (float(value) for value in raw.aminmax())
+    if low <= _RAISED * high:
+        return None
+    return f"has values of {low:.6g} to {high:.6g}: was something added to all of them? Zero is to be no light"
 
 
 def downsample(image: Tensor, factor: int) -> Tensor:

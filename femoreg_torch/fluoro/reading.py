@@ -32,10 +32,12 @@ _ITK_SUFFIXES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
 _PAGED_SUFFIXES = (".tif", ".tiff")
 _SCREEN_SUFFIXES = (".jpg", ".jpeg", ".bmp")  # what nobody stores intensities in
+_IN_COLOUR = "is a grey picture stored in colour, as pictures of a screen are: is its curve that of the detector?"
 LOOKS_LOG = "looks like logarithms already"  # what a file of fractions asks the case about
 _LOG_RANGE = (2.0, 20.0)  # of the greatest attenuation in an image: 45 cm of water at 60 keV are 9
 _MOST_PICTURE_BYTES = 2**28  # what the most pixels have as floats
 _BITS_PER_SAMPLE, _PHOTOMETRIC_INTERPRETATION, _SAMPLES_PER_PIXEL = 258, 262, 277  # tags of TIFF
+_TIFF, _BIG_TIFF, _MOST_TAGS = 42, 43, 2**16
 _GREY_STEPS = 12  # by which the colours of a grey JPEG may differ
 
 
@@ -80,11 +82,11 @@ def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
         )
     if path.suffix.lower() in _PAGED_SUFFIXES:
         _check_tiff(path, content, image)
-    screen = path.suffix.lower() in _SCREEN_SUFFIXES or (path.suffix.lower() == ".png" and image.dtype == np.uint8)
+    screen = path.suffix.lower() in _SCREEN_SUFFIXES or image.dtype == np.uint8
     if image.ndim == 3 and image.shape[-1] in (3, 4):
         colours = image[..., :3].astype(np.int64)
         if np.ptp(colours, axis=-1).max() <= (_GREY_STEPS if path.suffix.lower() in _SCREEN_SUFFIXES else 0):
-            image, screen = image[..., 1], True
+            return image[..., 1], (SCREEN if screen else _IN_COLOUR,)
     return image, (SCREEN,) if screen else ()
 
 
@@ -108,19 +110,26 @@ def _tiff_tag(tiff: bytes, wanted: int) -> int | None:
     """The first value of a tag of short numbers, or None.
 
     The first directory is looked through by itself, as Pillow does not open all kinds of numbers (TIFF 6.0, section 2).
+    BigTIFF is the same with places and counts of eight bytes.
     """
     order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
     with suppress(struct.error):
-        if order is not None and tiff[2:4] in (b"*\0", b"\0*"):
-            (place,) = struct.unpack_from(f"{order}I", tiff, 4)
-            (entries,) = struct.unpack_from(f"{order}H", tiff, place)
-            for start in range(place + 2, place + 2 + 12 * entries, 12):
-                tag, _, count, value = struct.unpack_from(f"{order}HHIH", tiff, start)
-                if tag == wanted and count > 2:  # more than the entry has room for: they stand elsewhere
-                    (elsewhere,) = struct.unpack_from(f"{order}I", tiff, start + 8)
-                    (value,) = struct.unpack_from(f"{order}H", tiff, elsewhere)
-                if tag == wanted:
-                    return int(value)
+        if order is None:
+            return None
+        (version,) = struct.unpack_from(f"{order}H", tiff, 2)
+        if version not in (_TIFF, _BIG_TIFF):
+            return None
+        offset, counter, first, each = ("I", "H", 4, 12) if version == _TIFF else ("Q", "Q", 8, 20)
+        (place,) = struct.unpack_from(f"{order}{offset}", tiff, first)
+        (entries,) = struct.unpack_from(f"{order}{counter}", tiff, place)
+        start = place + struct.calcsize(counter)
+        for entry in range(start, start + each * min(entries, _MOST_TAGS), each):
+            tag, _, count = struct.unpack_from(f"{order}HH{offset}", tiff, entry)
+            if tag == wanted:
+                value = entry + 4 + struct.calcsize(offset)
+                if 2 * count > struct.calcsize(offset):  # more than the entry has room for: they stand elsewhere
+                    (value,) = struct.unpack_from(f"{order}{offset}", tiff, value)
+                return int(struct.unpack_from(f"{order}H", tiff, value)[0])
     return None
 
 

@@ -33,6 +33,7 @@ from femoreg_torch.fluoro import (
     check_intensity,
     check_matches,
     find_distortion,
+    raised,
     read_image,
     read_stored,
     settled_intensity,
@@ -134,6 +135,8 @@ def _check_image(path: Path, view: View, carm: CArm | None, where: str, read: di
         found.attempt(lambda: check_intensity(stored.values, f"{where}: {path.name}"))
         if (dark := below_zero(stored.values, stored.padding)) is not None:
             found.warnings.append(f"{path.name} {dark}")
+        if (lifted := raised(stored.values)) is not None:
+            found.warnings.append(f"{path.name} {lifted}")
     if view.intensity == "raw" and stored.asks == LOOKS_LOG:
         found.warnings.append(f"{path.name} {LOOKS_LOG}, but the case says `intensity: raw`: bone is to be dark in it")
     if carm is not None and view.display is not None:

@@ -27,6 +27,7 @@ from femoreg_torch.fluoro import (
     find_distortion,
     find_shutter,
     intensity_of,
+    raised,
     read_image,
     read_stored,
     saturated,
@@ -59,6 +60,7 @@ from femoreg_torch.volume import (
 REGISTRATION_SPACING_MM = 1.0  # the paper resamples the CT to 1 mm (section III-A)
 TISSUE_SPACING_MM = 3.0  # soft tissue is smooth
 _MOST_BEYOND_MM = 500.0  # of an object's points from the box of its model: a guide may be longer than the sleeve
+_NEAREST = 0.1  # of the source distance, of a start pose: the housing of a tube is longer
 SOFT_HU = 50.0  # what is above is drawn as bone
 ByKind = dict[Kind, tuple[Tensor | None, ...]]  # something (H, W) of every view
 
@@ -171,11 +173,12 @@ def check_starts(objects: Mapping[str, RigidObject], sdd_mm: float, where: str) 
         if pose is None:
             continue
         depth = (pose[:3, :3] @ thing.reference_point + pose[:3, 3])[2].item()
-        if not 0 < depth < sdd_mm:
-            place = "behind the source" if depth <= 0 else "behind the detector"
+        if not _NEAREST * sdd_mm < depth < sdd_mm:
+            place = "behind the source" if depth <= 0 else "at the source" if depth < sdd_mm else "behind the detector"
             raise InputError(
-                f"{where}: the start pose puts {name} {place}, {depth:.0f} mm along the beam from the source. Give the "
-                "transform from its space to camera 1, in mm, and not its inverse."
+                f"{where}: the start pose puts {name} {place}, {depth:.3g} mm along the beam from the source (it has "
+                f"{sdd_mm:.0f} mm to the detector). Give the transform from its space to camera 1, in mm, and not its "
+                "inverse."
             )
 
 
@@ -349,8 +352,10 @@ def _read_image(case: Case, index: int, kind: Kind, shutters: Sequence[Shutter] 
     straight = values if distortion is None else distortion.straightened(values)
     image = display.to_camera(straight)
     raw = intensity_of(image) if logarithms else image
+    lifted = None
     if not logarithms:
         check_intensity(raw, file)
+        lifted = raised(raw)
     field, words, shutter = _field(case, index, stored, raw, distortion, shutters)
     if field is not None and not field.any():
         told_by = f"{case.folder}/case.yaml, views[{index}].field" if view.field is not None else f"{where}: its header"
@@ -359,7 +364,7 @@ def _read_image(case: Case, index: int, kind: Kind, shutters: Sequence[Shutter] 
     dark = None if logarithms else below_zero(stored.values, stored.padding)
     remarks = (
         *bent,
-        *(f"{view.images[kind].name} {remark}" for remark in (*stored.remarks, *filter(None, [dark, mended]))),
+        *(f"{view.images[kind].name} {remark}" for remark in (*stored.remarks, *filter(None, [dark, lifted, mended]))),
         *([words] if words else []),
     )
     attenuation = image if logarithms else attenuation_image(image, field)

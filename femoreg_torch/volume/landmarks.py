@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ def _signs(space: Any, where: str) -> tuple[float, float, float]:
 
 
 def _check_unit(unit: Any, where: str) -> None:
-    if unit != "mm":
+    if unit not in ("mm", ["mm"] * 3):  # of each axis
         raise InputError(f"{where}: the unit must be mm, found {shortened(unit)}. Convert the points.")
 
 
@@ -94,7 +94,7 @@ def _fcsv_points(path: Path) -> list[_Given]:
     values = ["" if _is_remark(line) else line for line in lines]
     separator = separator_of(values, max(columns.index(name) for name in needed) + 1)
     rows = list(rows_of(values, columns, needed, separator, str(path)))
-    return _of_rows(rows, {_SPACES.get(space, space): ("x", "y", "z")}, "label", path)
+    return _of_rows(rows, {_SPACES.get(space.upper(), space): ("x", "y", "z")}, "label", path)
 
 
 def _is_remark(line: str) -> bool:
@@ -103,7 +103,8 @@ def _is_remark(line: str) -> bool:
 
 def _csv_points(path: Path) -> list[_Given]:
     """The points of a table as 3D Slicer exports it, whose columns tell the space: l, p, s or r, a, s."""
-    rows = read_csv(path, ("label",))
+    read = read_csv(path, ("label",))
+    rows = [replace(row, values={name.lower(): value for name, value in row.values.items()}) for row in read]
     axes = {space: letters for space, letters in _AXES.items() if set(letters) <= set(rows[0].values)}
     if len(axes) != 1:
         raise InputError(

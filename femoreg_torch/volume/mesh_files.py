@@ -2,6 +2,7 @@
 
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -93,7 +94,8 @@ def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, tri
         options = {"split_objects": split_objects, "split_groups": split_groups, "group_material": False}
     try:
         with quiet():
-            _check_unzipped(path)
+            if path.suffix.lower() == ".3mf":
+                _check_3mf(path)
             text = _text(path)
             source = path if text is None else BytesIO(text.encode())
             scene = trimesh.load_scene(source, file_type=path.suffix[1:].lower(), process=False, **options)
@@ -125,6 +127,8 @@ def _text(path: Path) -> str | None:
     except UnicodeDecodeError:
         text = content.decode("latin-1")
     text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if path.suffix.lower() == ".obj":
+        return text.replace("\t", " ")
     if path.suffix.lower() == ".stl":
         begun, ended = (len(re.findall(rf"^[ \t]*{word}\b", text, re.M | re.I)) for word in ("solid", "endsolid"))
         if begun > ended:
@@ -147,13 +151,25 @@ def _is_binary(content: bytes, path: Path) -> bool:
     return False
 
 
-def _check_unzipped(path: Path) -> None:
-    """Raises `InputError` for a 3MF file, which is a zip archive, that would grow beyond any device."""
-    if path.suffix.lower() == ".3mf":
-        with zipfile.ZipFile(path) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
+def _check_3mf(path: Path) -> None:
+    """Raises `InputError` for a 3MF file that would grow beyond any device, or whose bodies trimesh cannot tell apart.
+
+    It is a zip archive. Objects have numbers within each of its models, and trimesh takes equal ones for one object.
+    """
+    with zipfile.ZipFile(path) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
         if size > _MOST_UNZIPPED:
             raise InputError(f"{path}: unpacks to {size / 2**20:.0f} MB, which no device has. Export it coarser.")
+        models = [entry for entry in archive.namelist() if entry.lower().endswith(".model")]
+        if models and not any(entry.lower().endswith("3dmodel.model") for entry in models):
+            raise InputError(f"{path}: its model is called {models[0]}, 3D/3dmodel.model was expected. Export it anew.")
+        found = [set(re.findall(rb"<(?:\w+:)?object\b[^>]*?\sid=\"([^\"]*)\"", archive.read(each))) for each in models]
+    numbers = Counter(number for each in found for number in each)
+    if twice := [number.decode(errors="replace") for number, count in numbers.items() if count > 1]:
+        raise InputError(
+            f"{path}: several of its {len(models)} models have an object of the number {twice[0]}, which cannot be "
+            "told apart here. Export it as one model, or each body as STL."
+        )
 
 
 def _bodies(scene: "trimesh.Scene", path: Path) -> "dict[str, trimesh.Trimesh]":

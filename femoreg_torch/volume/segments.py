@@ -121,7 +121,11 @@ def _merged(
 
 def _masks(folder: Path) -> list[Path]:
     """The masks in a folder, one file each, in order of their names."""
-    return sorted(path for path in folder.iterdir() if path.is_file() and path.name.lower().endswith(_MASK_SUFFIXES))
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.is_file() and path.name.lower().endswith(_MASK_SUFFIXES) and not path.name.startswith("._")  # macOS's
+    )
 
 
 def _mask_reader(folder: Path) -> Callable[[Segment], tuple[NDArray[np.bool_], sitk.Image]]:

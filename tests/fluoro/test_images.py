@@ -15,7 +15,7 @@ from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, XRayAngiographicImageStorage
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.fluoro import check_matches, read_image, write_image
+from femoreg_torch.fluoro import check_matches, raised, read_image, read_stored, write_image
 from femoreg_torch.geometry import load_carm
 
 PIXELS = np.random.default_rng(0).integers(0, 4096, (12, 10), dtype=np.uint16)
@@ -202,10 +202,11 @@ def test_a_tiff_of_8_bits_that_says_that_0_is_white_is_turned_over(tmp_path: Pat
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.int16, np.uint32, np.int32, np.float32, np.float64])
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_other_tiffs_that_say_that_0_is_white_are_refused(tmp_path: Path, dtype: type, order: str) -> None:
+@pytest.mark.parametrize("big", [False, True])
+def test_other_tiffs_that_say_that_0_is_white_are_refused(tmp_path: Path, dtype: type, order: str, big: bool) -> None:
     """How bright their white is, they do not say: 12 bits often stand in 16."""
     for kind in ("minisblack", "miniswhite"):
-        tifffile.imwrite(tmp_path / f"{kind}.tif", PIXELS.astype(dtype), photometric=kind, byteorder=order)
+        tifffile.imwrite(tmp_path / f"{kind}.tif", PIXELS.astype(dtype), photometric=kind, byteorder=order, bigtiff=big)
     np.testing.assert_array_equal(read_image(tmp_path / "minisblack.tif").numpy(), PIXELS)
     with pytest.raises(InputError, match=r"miniswhite\.tif: says that 0 is white"):
         read_image(tmp_path / "miniswhite.tif")
@@ -213,8 +214,9 @@ def test_other_tiffs_that_say_that_0_is_white_are_refused(tmp_path: Path, dtype:
 
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("channels", [2, 3])
+@pytest.mark.parametrize("big", [False, True])
 def test_a_tiff_of_16_bits_with_channels_beside_the_grey_one_is_refused(
-    tmp_path: Path, order: str, channels: int
+    tmp_path: Path, order: str, channels: int, big: bool
 ) -> None:
     """OpenCV gives 12 bits in 16 as values from 0 to 15, or mixes the channels; of 8 bits none are lost."""
     for dtype in (np.uint8, np.uint16):
@@ -222,7 +224,12 @@ def test_a_tiff_of_16_bits_with_channels_beside_the_grey_one_is_refused(
         pixels = np.stack([grey, *[np.full_like(grey, np.iinfo(dtype).max)] * (channels - 1)], -1)
         extra = ["unassalpha", "unspecified"][: channels - 1]
         tifffile.imwrite(
-            tmp_path / f"{dtype.__name__}.tif", pixels, photometric="minisblack", extrasamples=extra, byteorder=order
+            tmp_path / f"{dtype.__name__}.tif",
+            pixels,
+            photometric="minisblack",
+            extrasamples=extra,
+            byteorder=order,
+            bigtiff=big,
         )
     np.testing.assert_array_equal(read_image(tmp_path / "uint8.tif").numpy(), PIXELS.astype(np.uint8))
     with pytest.raises(InputError, match=r"uint16\.tif: has grey values of 16 bits and an alpha or another"):
@@ -239,3 +246,17 @@ def test_a_picture_that_is_to_be_shown_turned_is_refused(tmp_path: Path, suffix:
     assert read_image(tmp_path / f"view1{suffix}").shape == PIXELS.shape
     with pytest.raises(InputError, match="is to be shown turned or mirrored"):
         read_image(tmp_path / f"view6{suffix}")
+
+
+def test_an_offset_of_all_values_is_told() -> None:
+    image = torch.linspace(0.02, 1, 64 * 64).reshape(64, 64) * 4000
+    assert raised(image) is None
+    assert "has values of 32848 to 36768: was something added" in (raised(image + 32768) or "")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_pictures_of_8_bits_are_told(tmp_path: Path, suffix: str) -> None:
+    cv2.imwrite(str(tmp_path / f"view{suffix}"), (PIXELS // 16).astype(np.uint8))
+    assert any("picture of a screen" in remark for remark in read_stored(tmp_path / f"view{suffix}").remarks)
+    write_image(tmp_path / f"deep{suffix}", torch.from_numpy(PIXELS).to(torch.uint16))
+    assert not read_stored(tmp_path / f"deep{suffix}").remarks

@@ -32,7 +32,9 @@ def started_at(depth_mm: float) -> dict[str, RigidObject]:
     return {"device": RigidObject(VOLUME, VOLUME.centre(), ("device",), Start(camera1_from=at(depth_mm)))}
 
 
-@pytest.mark.parametrize(("depth_mm", "place"), [(-600, "behind the source"), (1500, "behind the detector")])
+@pytest.mark.parametrize(
+    ("depth_mm", "place"), [(-600, "behind the source"), (0.6, "at the source"), (1500, "behind the detector")]
+)
 def test_a_device_that_is_not_in_the_beam(depth_mm: float, place: str) -> None:
     check_starts(started_at(600), 1000.0, "case.yaml")
     with pytest.raises(InputError, match=f"case.yaml: the start pose puts device {place}"):

@@ -52,6 +52,9 @@ FILES = {
     "RAS.fcsv": fcsv("RAS", RAS_HEAD, RAS_NOTCH),
     "old RAS.fcsv": fcsv("0", RAS_HEAD, RAS_NOTCH),
     "old LPS.fcsv": fcsv("1", HEAD, NOTCH),
+    "small.fcsv": fcsv("lps", HEAD, NOTCH),
+    "units.mrk.json": json.dumps(slicer("LPS", HEAD, NOTCH, coordinateUnits=["mm"] * 3)),
+    "capitals.csv": f"Label,L,P,S\nGSN-r,{','.join(map(str, NOTCH))}\nFH-l,{','.join(map(str, HEAD))}\n",
 }
 
 

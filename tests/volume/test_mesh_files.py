@@ -51,6 +51,27 @@ def test_a_3mf_file_tells_its_unit(tmp_path: Path) -> None:
     check_bodies(read_bodies(tmp_path / "device.3mf", ["sleeve", "handle"]))
 
 
+def test_models_of_a_3mf_file_that_number_their_objects_alike_are_refused(tmp_path: Path) -> None:
+    """As the production extension may: each model has numbers of its own, and trimesh draws one body in two places."""
+    with ZipFile(write(tmp_path / "written.3mf")) as old, ZipFile(tmp_path / "device.3mf", "w") as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name))
+        new.writestr("3D/Objects/other.model", old.read("3D/3dmodel.model"))
+    with pytest.raises(InputError, match="several of its 2 models have an object of the number"):
+        read_mesh(tmp_path / "device.3mf")
+    with ZipFile(tmp_path / "written.3mf") as old, ZipFile(tmp_path / "device.3mf", "w") as new:
+        for name in old.namelist():
+            new.writestr(name.replace("3dmodel", "part"), old.read(name))
+    with pytest.raises(InputError, match=r"its model is called 3D/part\.model"):
+        read_mesh(tmp_path / "device.3mf")
+
+
+def test_an_obj_file_with_tabs_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path / "device.obj")
+    path.write_text(path.read_text(encoding="utf-8").replace(" ", "\t"), encoding="utf-8")
+    assert read_mesh(path).volume == pytest.approx(HANDLE.volume + SLEEVE.volume, rel=1e-4)
+
+
 @pytest.mark.parametrize("before", ["", "o device\n"])
 def test_groups_of_an_obj_file_are_bodies(tmp_path: Path, before: str) -> None:
     """Also where they stand within a single object, and where the materials of a renderer run across them."""

@@ -102,6 +102,7 @@ def test_a_folder_with_a_mask_for_each_bone(tmp_path: Path, affine: np.ndarray) 
     masks = {name: np.zeros((8, 7, 6), bool) for name in ("femur_left", "hip_left", "hip_right", "liver")}
     masks["femur_left"][5:, 1:3, :3], masks["hip_left"][4:6, 2:5, 2:5], masks["liver"][:2] = True, True, True
     folder = write_masks(tmp_path / "segmentations", masks, affine)
+    (folder / "._femur_left.nii.gz").write_bytes(b"\0\5\x16\7")  # as macOS leaves them on foreign disks
     (folder / "statistics.json").write_text("{}", encoding="utf-8")
     assert segment_names(folder) == {"femur_left": (1,), "hip_left": (2,), "hip_right": (3,), "liver": (4,)}
     table = read_bones(Fields({"labels": "segmentations"}, str(tmp_path / "case.yaml")), tmp_path, HIP)
