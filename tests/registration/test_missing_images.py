@@ -159,7 +159,7 @@ def case_with(folder: Path, has: list[tuple[str, ...]]) -> Case:
     for number, kinds in enumerate(has):
         paths = {kind: folder / f"{number}_{kind}.tif" for kind in kinds}
         for path in paths.values():
-            write_image(path, torch.randint(20000, 30000, (88, 88), generator=generator).to(torch.uint16))
+            write_image(path, torch.randint(2000, 30000, (88, 88), generator=generator).to(torch.uint16))
         views.append(View(paths))
     model = Model(folder / "nail.stl", 5000)
     objects = {"bone": CaseObject("bone"), "nail": CaseObject("nail", model=model, images=("device",))}
