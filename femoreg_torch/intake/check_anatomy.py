@@ -18,6 +18,7 @@ from femoreg_torch.intake.found import Found
 from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.pnp import MINIMUM
+from femoreg_torch.registration.frames import MOST_OFF_HEAD_MM
 from femoreg_torch.segment import head_centre
 from femoreg_torch.volume import (
     BoneLabels,
@@ -38,7 +39,7 @@ from femoreg_torch.volume import (
 )
 from femoreg_torch.volume.bones import nearest_voxel
 
-_MOST_BESIDE_MM = 5.0  # of an entry point beside its femur, and of a femoral head from the sphere that fits it
+_MOST_BESIDE_MM = 5.0  # of an entry point beside its femur
 _MOST_NAMES = 8
 
 
@@ -148,7 +149,7 @@ def check_head(side: Side, seen: SeenAnatomy, found: Found) -> None:
     if centre is None:
         return
     off = float((centre - seen.landmarks[name]).norm())
-    if off > _MOST_BESIDE_MM:
+    if off > MOST_OFF_HEAD_MM:
         where = ", ".join(f"{v:.1f}" for v in centre.tolist())
         found.warnings.append(
             f"landmarks: {name} lies {off:.0f} mm from the middle of the sphere that fits the femoral head of the "

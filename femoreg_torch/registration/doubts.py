@@ -90,7 +90,7 @@ def doubts(
     displays = [case.display_of(view) for view in range(len(case.views))]
     if strange := doubts_about_the_images(scene, poses, imaging):
         plan = *doubts_about_the_plan(case, scene), *doubts_about_the_guide(case, poses)
-        return (*doubts_about_units(case, told, True), *strange, *plan)
+        return (*told.contradictions, *doubts_about_units(case, told, True), *strange, *plan)
     others: list[Callable[[], tuple[str, ...]]] = [
         lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
@@ -110,7 +110,7 @@ def doubts(
         *doubts_about_rigidity(clear, poses, imaging),
     )
     found = (*doubts_about_units(case, told, bool(found)), *found)
-    return (*found, *doubts_beside_devices(clear, poses, imaging, bool(found)))
+    return (*told.contradictions, *found, *doubts_beside_devices(clear, poses, imaging, bool(found)))
 
 
 def doubts_about_the_images(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:

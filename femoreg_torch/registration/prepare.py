@@ -36,6 +36,7 @@ from femoreg_torch.fluoro import (
     without_defects,
     without_penumbra,
 )
+from femoreg_torch.registration.frames import doubts_about_the_frame
 from femoreg_torch.registration.models import ModelVolumes, model_attenuation, told_of_middle
 from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
@@ -72,6 +73,7 @@ def prepare_scene(case: Case) -> Scene:
     from_ct = [thing for thing in case.objects.values() if thing.model is None]
     objects: dict[str, RigidObject] = {}
     tissue = outline = None
+    contradictions: tuple[str, ...] = ()
     with ThreadPoolExecutor(max_workers=1) as beside:  # images and models are read while the CT is
         reading = beside.submit(_read_with_saturated, case)
         making = {
@@ -82,6 +84,7 @@ def prepare_scene(case: Case) -> Scene:
         if from_ct:
             ct, bones = read_bones(case)
             outlining = beside.submit(outline_of, bones, case.anatomy)
+            framing = beside.submit(doubts_about_the_frame, case, bones)
             check_inside(case.landmarks, ct)
             told_of_ct = (*bones.notes, *_check_anatomy(case, ct, bones))
             _check_path(case, ct)
@@ -91,7 +94,7 @@ def prepare_scene(case: Case) -> Scene:
         if from_ct:
             told = (*told_of_ct, *told)
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
-            outline = outlining.result()
+            outline, contradictions = outlining.result(), framing.result()
         made = {name: model.result() for name, model in making.items()}
     for name, (volumes, axis) in made.items():
         thing = case.objects[name]
@@ -122,6 +125,7 @@ def prepare_scene(case: Case) -> Scene:
         camera_from_camera1=torch.stack(cameras) if known else None,
         left_on_left=tuple(view for view in range(len(case.views)) if case.display_of(view).left_on_left),
         missing=told,
+        contradictions=contradictions,
     )
 
 

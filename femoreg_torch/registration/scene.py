@@ -92,6 +92,7 @@ class Scene:
     scatter: float | None = None  # see `Imaging`, as the shadow of a device tells it
     left_on_left: tuple[int, ...] = ()  # views (from 0) seen from behind the patient: left is left
     missing: tuple[str, ...] = ()  # what the case lacks and what shutters hide, in words
+    contradictions: tuple[str, ...] = ()  # of its files among one another, in words, which are doubts of a result
 
     @property
     def device(self) -> torch.device:

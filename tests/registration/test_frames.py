@@ -1,0 +1,66 @@
+"""Landmarks that do not lie where the label map has the femoral heads: the plan stands in their frame."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from femoreg_torch.case import Case
+from femoreg_torch.case.femoroplasty import planned
+from femoreg_torch.geometry import load_carm
+from femoreg_torch.registration.frames import doubts_about_the_frame
+from femoreg_torch.volume import BoneLabels, Volume, axis_aligned
+
+HEADS = {"left": torch.tensor([88.0, -3.0, 4.0]).double(), "right": torch.tensor([-90.0, 2.0, 0.0]).double()}
+IDS = {"femur_left": 1, "femur_right": 2, "hip_left": 3, "hip_right": 4}
+
+
+def bones(moved: Tensor | None = None) -> BoneLabels:
+    """Balls of 48 mm on shafts, in sockets that are open below."""
+    affine = axis_aligned((2.0, 2.0, 2.0), (-140.0, -50.0, -110.0))
+    z, y, x = torch.meshgrid(*(torch.arange(n).double() for n in (85, 50, 140)), indexing="ij")
+    points = torch.stack([x, y, z], -1) * 2 + affine[:3, 3]
+    data = torch.zeros(x.shape, dtype=torch.int16)
+    for side, head in HEADS.items():
+        away = points - head
+        distance = away.norm(dim=-1)
+        shaft = (away[..., :2].norm(dim=-1) < 14) & (away[..., 2] < 0)
+        data[(distance < 24) | shaft] = IDS[f"femur_{side}"]
+        data[(distance > 27) & (distance < 36) & (away[..., 2] > 0)] = IDS[f"hip_{side}"]
+    if moved is not None:
+        affine[:3, 3] += moved
+    return BoneLabels(Volume(data, affine), IDS)
+
+
+def case(left: Tensor, right: Tensor) -> Case:
+    landmarks = {"FH-l": left, "FH-r": right}
+    plan = planned("left", left + torch.tensor([40.0, 0, -60]).double(), left, None)
+    return Case(Path("case"), load_carm("cios_fusion"), {}, (), landmarks=landmarks, plan=plan)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "says"),
+    [
+        ((0, 0, 0), (0, 0, 0), None),
+        ((2, -1, 1), (-1, 2, 0), None),  # as readers are off
+        ((0, 4, 0), (0, -4, 0), None),
+        ((0, 8, 0), (0, 0, 0), "FH-l, where the planned path ends, lies 8.0 mm from the middle"),
+        ((0, 0, 0), (0, 8, 0), None),  # the path ends in the other one
+        ((0, 0, 4), (0, 0.5, 4), "both femoral heads of the label map lie "),
+    ],
+)
+def test_heads_beside_their_landmarks(left: tuple[float, ...], right: tuple[float, ...], says: str | None) -> None:
+    off = [torch.tensor(one, dtype=torch.float64) for one in (left, right)]
+    told = doubts_about_the_frame(case(HEADS["left"] + off[0], HEADS["right"] + off[1]), bones())
+    assert len(told) == (says is not None)
+    assert all(each.startswith(says or "") for each in told)
+
+
+def test_a_ct_of_another_origin() -> None:
+    right = case(HEADS["left"], HEADS["right"])
+    assert doubts_about_the_frame(right, bones(torch.tensor([1.0, 0, 0]).double())) == ()
+    (told,) = doubts_about_the_frame(right, bones(torch.tensor([0, 10.0, 0]).double()))
+    assert "both femoral heads of the label map lie" in told
+    far = bones(torch.tensor([0, 0, 300.0]).double())  # other checks tell that the landmarks lie outside of the CT
+    assert doubts_about_the_frame(right, far) == ()
