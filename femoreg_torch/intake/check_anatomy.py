@@ -18,7 +18,7 @@ from femoreg_torch.intake.found import Found
 from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.pnp import MINIMUM
-from femoreg_torch.registration.frames import MOST_OFF_HEAD_MM
+from femoreg_torch.registration.frames import MOST_OFF_BONE_MM, MOST_OFF_HEAD_MM
 from femoreg_torch.segment import head_centre
 from femoreg_torch.volume import (
     BoneLabels,
@@ -39,7 +39,6 @@ from femoreg_torch.volume import (
 )
 from femoreg_torch.volume.bones import nearest_voxel
 
-_MOST_BESIDE_MM = 5.0  # of an entry point beside its femur
 _MOST_NAMES = 8
 
 
@@ -182,7 +181,7 @@ def check_path(path: PlannedPath, side: Side, seen: SeenAnatomy, found: Found) -
             found.problem(
                 f"plan: the {name} lies on the {femora[near[0]]}, but `side` is {side}. Correct one of the two."
             )
-        elif near[1] > _MOST_BESIDE_MM:
+        elif near[1] > MOST_OFF_BONE_MM:
             found.warnings.append(
                 f"plan: the {name} ({where}) mm LPS lies {near[1]:.0f} mm outside the femur: look at it"
             )

@@ -1,4 +1,4 @@
-"""Do landmarks and plan lie in the frame of CT and label map?
+"""Do landmarks and plan lie where CT and label map have the bones?
 
 Images do not tell: they place the bones of the label map. Landmarks that lie some mm beside them still start the
 registration, and the planned path, which stands in their frame, ends beside the head by as much. The femoral heads are
@@ -8,11 +8,38 @@ round, so that the label map by itself says where their middles are.
 from femoreg_torch.case import Case
 from femoreg_torch.segment import head_centre
 from femoreg_torch.volume import BoneLabels
+from femoreg_torch.volume.bones import nearest_voxel
 
 # Seen of 60 cases of three simulators, whose landmarks were told by a surface, by rules or by their makers: at most
 # 2.7 mm, and both heads alike by at most 1.0 mm.
 MOST_OFF_HEAD_MM = 5.0
+MOST_OFF_BONE_MM, _FAR_OFF_BONE_MM = 5.0, 12.0  # of an entry point or target, from the middle of the nearest voxel
 _MOST_ALIKE_MM, _ALIKE_MM = 2.5, 2.0  # of both in one direction, and how far that may differ between them
+
+
+def doubts_about_the_files(case: Case, bones: BoneLabels) -> tuple[str, ...]:
+    """All that landmarks and plan say against the label map, in words."""
+    return (*doubts_about_the_frame(case, bones), *doubts_about_the_ends(case, bones))
+
+
+def doubts_about_the_ends(case: Case, bones: BoneLabels) -> tuple[str, ...]:
+    """Entry points and targets a little outside the planned bone of the label map, in words.
+
+    What is far outside is told by its attenuation, which knows no edge to a millimetre (`doubts_about_the_plan`).
+    """
+    plan = case.plan
+    if plan is None or not case.objects[plan.object].bones:
+        return ()
+    ids = bones.of(case.objects[plan.object].bones, case.anatomy)
+    told = []
+    for name, point in (("entry point", plan.entry_point), ("target", plan.target)):
+        near = nearest_voxel(bones.labels, ids, point)
+        if near is not None and MOST_OFF_BONE_MM < near[1] <= _FAR_OFF_BONE_MM:
+            told.append(
+                f"the planned {name} lies {near[1]:.0f} mm outside the {plan.object}: check `plan`; its points are LPS "
+                "mm of the CT"
+            )
+    return tuple(told)
 
 
 def doubts_about_the_frame(case: Case, bones: BoneLabels) -> tuple[str, ...]:

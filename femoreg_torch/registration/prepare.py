@@ -36,7 +36,7 @@ from femoreg_torch.fluoro import (
     without_defects,
     without_penumbra,
 )
-from femoreg_torch.registration.frames import doubts_about_the_frame
+from femoreg_torch.registration.frames import doubts_about_the_files
 from femoreg_torch.registration.models import ModelVolumes, model_attenuation, told_of_middle
 from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
@@ -84,7 +84,7 @@ def prepare_scene(case: Case) -> Scene:
         if from_ct:
             ct, bones = read_bones(case)
             outlining = beside.submit(outline_of, bones, case.anatomy)
-            framing = beside.submit(doubts_about_the_frame, case, bones)
+            framing = beside.submit(doubts_about_the_files, case, bones)
             check_inside(case.landmarks, ct)
             told_of_ct = (*bones.notes, *_check_anatomy(case, ct, bones))
             _check_path(case, ct)

@@ -3,7 +3,9 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.geometry import transform_points
@@ -14,6 +16,7 @@ _AROUND_MM = 6.0  # of the guide's line: thinner than most handles and arms besi
 _LOOKED_AT_MM = -40.0, 15.0  # along the guide from the tip: a drill may stand out of a sleeve whose model lacks it
 _END_MM = 8.0  # of the model: the slanted end of a needle is shorter, and its tip lies on one side
 _DIRECTIONS = 72
+_WIDEST_MM = 15.0  # from the guide's line: a plate or a handle is no end of a guide
 
 
 @dataclass(frozen=True)
@@ -35,16 +38,34 @@ def guide_end(volume: Volume, base: Tensor, tip: Tensor) -> GuideEnd | None:
     places = transform_points(volume.lps_from_index, filled) - tip
     along = places @ axis
     near = (along > _LOOKED_AT_MM[0]) & (along < _LOOKED_AT_MM[1])
-    aside = places[near] - along[near, None] * axis
+    across = torch.linalg.svd(axis[None])[2][1:]  # (2, 3), at right angles to the guide
+    along, aside = along[near], places[near] @ across.T
     around = aside.norm(dim=1) < _AROUND_MM
-    along, aside = along[near][around], aside[around]
-    if not len(along):
+    if not around.any():
         return None
     half_mm = max(volume.spacing_mm) / 2  # of a voxel about its centre
-    last = float(along.max())
-    aside = aside[along > last - _END_MM]
-    across = torch.linalg.svd(axis[None])[2][1:]  # (2, 3), at right angles to the guide
+    last = float(along[around].max())
+    end = aside[(along > last - _END_MM) & (along <= last)]
+    beside = end[end.norm(dim=1) < _AROUND_MM]
     turns = torch.arange(_DIRECTIONS, dtype=torch.float64) * (2 * math.pi / _DIRECTIONS)
-    directions = torch.stack([turns.cos(), turns.sin()], 1) @ across
-    gap = float((aside @ directions.T).amin(0).max())  # to the convex hull of what the end holds
-    return GuideEnd(-(last + half_mm), float(aside.mean(0).norm()), max(0.0, gap - half_mm))
+    directions = torch.stack([turns.cos(), turns.sin()], 1)
+    gap = float((beside @ directions.T).amin(0).max())  # to the convex hull of what the end holds
+    middle = _whole(end, beside, 4 * half_mm).mean(0)  # no gaps within a piece
+    return GuideEnd(-(last + half_mm), float(middle.norm()), max(0.0, gap - half_mm))
+
+
+def _whole(end: Tensor, beside: Tensor, cell_mm: float) -> Tensor:
+    """Of places (N, 2) across the guide, all of one piece with those `beside` its line; these alone of a wide piece.
+
+    A thick sleeve of which the line leaves the middle lies near it in part alone.
+    """
+    end = end[end.norm(dim=1) < _WIDEST_MM]
+    cells = (end / cell_mm).round().long()
+    first = cells.amin(0)
+    filled = np.zeros((cells.amax(0) - first + 1).tolist(), bool)
+    filled[tuple((cells - first).T.numpy())] = True
+    pieces = ndimage.label(filled, np.ones((3, 3)))[0]
+    of = pieces[tuple((cells - first).T.numpy())]
+    wanted = pieces[tuple(((beside / cell_mm).round().long() - first).T.numpy())]
+    whole = end[torch.from_numpy(np.isin(of, wanted))]
+    return beside if float(whole.norm(dim=1).max()) > _WIDEST_MM - cell_mm else whole

@@ -1,15 +1,16 @@
 """Landmarks that do not lie where the label map has the femoral heads: the plan stands in their frame."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from femoreg_torch.case import Case
+from femoreg_torch.case import Case, CaseObject
 from femoreg_torch.case.femoroplasty import planned
 from femoreg_torch.geometry import load_carm
-from femoreg_torch.registration.frames import doubts_about_the_frame
+from femoreg_torch.registration.frames import doubts_about_the_ends, doubts_about_the_frame
 from femoreg_torch.volume import BoneLabels, Volume, axis_aligned
 
 HEADS = {"left": torch.tensor([88.0, -3.0, 4.0]).double(), "right": torch.tensor([-90.0, 2.0, 0.0]).double()}
@@ -36,7 +37,18 @@ def bones(moved: Tensor | None = None) -> BoneLabels:
 def case(left: Tensor, right: Tensor) -> Case:
     landmarks = {"FH-l": left, "FH-r": right}
     plan = planned("left", left + torch.tensor([40.0, 0, -60]).double(), left, None)
-    return Case(Path("case"), load_carm("cios_fusion"), {}, (), landmarks=landmarks, plan=plan)
+    femur = CaseObject("femur", bones=("femur_left",))
+    return Case(Path("case"), load_carm("cios_fusion"), {"femur": femur}, (), landmarks=landmarks, plan=plan)
+
+
+@pytest.mark.parametrize(("beside_mm", "told"), [(0, 0), (3, 0), (8, 1), (30, 0)])  # the last is told elsewhere
+def test_an_entry_point_outside_the_bone(beside_mm: float, told: int) -> None:
+    right = case(HEADS["left"], HEADS["right"])
+    assert right.plan is not None
+    entry = HEADS["left"] + torch.tensor([14.0 + beside_mm, 0, -50], dtype=torch.float64)
+    found = doubts_about_the_ends(replace(right, plan=replace(right.plan, entry_point=entry)), bones())
+    assert len(found) == told
+    assert all(each.startswith("the planned entry point lies") for each in found)
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,15 @@ def test_another_origin_is_told_by_as_much(direction: list[float], along: float,
     assert len(told_of_middle("device", voxels(needle(2.0, 100 * axis)), points)) == (across != 0)
 
 
+def test_a_line_within_a_thick_sleeve_passes_beside_its_middle() -> None:
+    sleeve = trimesh.creation.annulus(4.5, 6.0, 100)
+    sleeve.apply_translation([0, 0, 50])
+    end = guide_end(voxels(sleeve), BASE, TIP + 0.05 * torch.linalg.cross(BASE, torch.tensor([0.0, 1, 0]).double()))
+    assert end is not None
+    assert end.off_middle_mm == pytest.approx(5, abs=0.3)
+    assert end.aside_mm == 0
+
+
 def test_what_stands_beside_a_guide_is_no_end_of_it() -> None:
     pin = trimesh.creation.cylinder(2.0, segment=[[12, 0, -14], [12, 0, 40]])
     end = guide_end(voxels(needle(), pin), BASE, TIP)
