@@ -5,6 +5,8 @@ registration, and the planned path, which stands in their frame, ends beside the
 round, so that the label map by itself says where their middles are.
 """
 
+import torch
+
 from femoreg_torch.case import Case
 from femoreg_torch.segment import head_centre
 from femoreg_torch.volume import BoneLabels
@@ -14,7 +16,8 @@ from femoreg_torch.volume.bones import nearest_voxel
 # 2.7 mm, and both heads alike by at most 1.0 mm.
 MOST_OFF_HEAD_MM = 5.0
 MOST_OFF_BONE_MM, _FAR_OFF_BONE_MM = 5.0, 12.0  # of an entry point or target, from the middle of the nearest voxel
-_MOST_ALIKE_MM, _ALIKE_MM = 2.5, 2.0  # of both in one direction, and how far that may differ between them
+# Of both in one direction, besides half a voxel, and how far that may differ between them.
+_MOST_ALIKE_MM, _ALIKE_MM = 2.0, 2.0
 
 
 def doubts_about_the_files(case: Case, bones: BoneLabels) -> tuple[str, ...]:
@@ -33,6 +36,8 @@ def doubts_about_the_ends(case: Case, bones: BoneLabels) -> tuple[str, ...]:
     ids = bones.of(case.objects[plan.object].bones, case.anatomy)
     told = []
     for name, point in (("entry point", plan.entry_point), ("target", plan.target)):
+        if any(torch.equal(point, landmark) for landmark in case.landmarks.values()):
+            continue  # the middle of a head: the label map may hold the shells of bones alone
         near = nearest_voxel(bones.labels, ids, point)
         if near is not None and MOST_OFF_BONE_MM < near[1] <= _FAR_OFF_BONE_MM:
             told.append(
@@ -53,7 +58,8 @@ def doubts_about_the_frame(case: Case, bones: BoneLabels) -> tuple[str, ...]:
     if len(off) == 2:
         one, other = off.values()
         alike = float((one + other).norm() / 2)
-        if alike > _MOST_ALIKE_MM and float((one - other).norm()) < _ALIKE_MM:
+        most = _MOST_ALIKE_MM + max(bones.labels.spacing_mm) / 2
+        if alike > most and float((one - other).norm()) < _ALIKE_MM:
             return (
                 f"both femoral heads of the label map lie {alike:.1f} mm from FH-l and FH-r, in the same direction: "
                 "landmarks, and likely the plan, are not in the frame of CT and label map; check the origin of both",
@@ -63,5 +69,5 @@ def doubts_about_the_frame(case: Case, bones: BoneLabels) -> tuple[str, ...]:
         f"{name}, where the planned path ends, lies {float(away.norm()):.1f} mm from the middle of the femoral head of "
         "the label map: check that landmark, and that it is in the frame of the CT"
         for name, away in off.items()
-        if float(away.norm()) > MOST_OFF_HEAD_MM and target is not None and bool((case.landmarks[name] == target).all())
+        if float(away.norm()) > MOST_OFF_HEAD_MM and target is not None and torch.equal(case.landmarks[name], target)
     )

@@ -13,7 +13,7 @@ from femoreg_torch.volume import BoneLabels, Volume, crop
 
 HEAD_RADIUS_MM = (15.0, 35.0)  # of what may be a femoral head at all; other spheres are none
 DOUBTED_RESIDUAL_MM = 1.5
-_NEAR_MM = 45.0  # of a landmark in the head, to each side: a head has 32 mm, and the landmark may be some mm off
+_NEAR_MM = 40.0  # of a landmark in the head, to each side: a head has 32 mm, and the landmark may be some mm off
 # Of adults. Diameters of 170 femora: men 49 ± 3 mm, women 44 ± 3 mm (Mall et al., Forensic Science International 113
 # (2000) 315); Thai women 40 mm in the mean (Saengnipanthkul and Techasatien, J Med Assoc Thai 95 (2012) 790). 34 and
 # 64 mm lie 3 deviations below the women of the first, and 5 above its men.
@@ -48,7 +48,7 @@ def fitted_heads(labels: Volume, ids: Mapping[str, int]) -> dict[str, Head]:
 def head_centre(bones: BoneLabels, side: str, near: Tensor | None = None) -> Tensor | None:
     """Centre (3,), LPS mm, of the sphere that fits a femoral head; None where bones are missing or it is no sphere.
 
-    With a point (3,) `near` it, it is looked for within 45 mm along each axis alone, which is faster.
+    With a point (3,) `near` it, it is looked for within 40 mm along each axis alone, which is faster.
     """
     labels = bones.labels if near is None else _around(bones.labels, near)
     wanted = {name: n for name, n in bones.ids.items() if name.endswith(side) and (labels.data == n).any()}

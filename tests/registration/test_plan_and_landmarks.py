@@ -69,6 +69,15 @@ def test_heads_beside_their_landmarks(left: tuple[float, ...], right: tuple[floa
     assert all(each.startswith(says or "") for each in told)
 
 
+def test_a_label_map_of_shells_holds_no_middle_of_a_head() -> None:
+    right, hollow = case(HEADS["left"], HEADS["right"]), bones()
+    points = torch.stack(torch.meshgrid(*(torch.arange(n).double() for n in (85, 50, 140)), indexing="ij"), -1).flip(-1)
+    away = (points * 2 + hollow.labels.lps_from_index[:3, 3] - HEADS["left"]).norm(dim=-1)
+    hollow.labels.data[away < 18] = 0
+    assert doubts_about_the_ends(right, hollow) == ()
+    assert doubts_about_the_frame(right, hollow) == ()
+
+
 def test_a_ct_of_another_origin() -> None:
     right = case(HEADS["left"], HEADS["right"])
     assert doubts_about_the_frame(right, bones(torch.tensor([1.0, 0, 0]).double())) == ()
