@@ -36,8 +36,8 @@ from femoreg_torch.fluoro import (
     without_defects,
     without_penumbra,
 )
-from femoreg_torch.registration.frames import doubts_about_the_files
 from femoreg_torch.registration.models import ModelVolumes, model_attenuation, told_of_middle
+from femoreg_torch.registration.plan_and_landmarks import doubts_about_the_files
 from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.registration.silhouette import outline_of

@@ -10,7 +10,7 @@ from torch import Tensor
 from femoreg_torch.case import Case, CaseObject
 from femoreg_torch.case.femoroplasty import planned
 from femoreg_torch.geometry import load_carm
-from femoreg_torch.registration.frames import doubts_about_the_ends, doubts_about_the_frame
+from femoreg_torch.registration.plan_and_landmarks import doubts_about_the_ends, doubts_about_the_frame
 from femoreg_torch.volume import BoneLabels, Volume, axis_aligned
 
 HEADS = {"left": torch.tensor([88.0, -3.0, 4.0]).double(), "right": torch.tensor([-90.0, 2.0, 0.0]).double()}
