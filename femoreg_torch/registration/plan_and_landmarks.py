@@ -9,7 +9,7 @@ import torch
 
 from femoreg_torch.case import Case
 from femoreg_torch.segment import head_centre
-from femoreg_torch.volume import BoneLabels
+from femoreg_torch.volume import BoneLabels, Volume, shifted_labels
 from femoreg_torch.volume.bones import nearest_voxel
 
 # Seen of 60 cases of three simulators, whose landmarks were told by a surface, by rules or by their makers: at most
@@ -20,9 +20,17 @@ MOST_OFF_BONE_MM, _FAR_OFF_BONE_MM = 5.0, 12.0  # of an entry point or target, f
 _MOST_ALIKE_MM, _ALIKE_MM = 2.0, 2.0
 
 
-def doubts_about_the_files(case: Case, bones: BoneLabels) -> tuple[str, ...]:
-    """All that landmarks and plan say against the label map, in words."""
-    return (*doubts_about_the_frame(case, bones), *doubts_about_the_ends(case, bones))
+def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]:
+    """All that CT, landmarks and plan say against the label map, which lies on the CT's grid, in words."""
+    shift = shifted_labels(ct, bones.labels)
+    told = []
+    if shift is not None:
+        by = ", ".join(f"{mm + 0.0:.0f}" for mm in shift.tolist())
+        told.append(
+            f"the label map would lie on the bones of the CT if it were moved by ({by}) mm LPS: check that it belongs "
+            "to this CT, and the origin of both"
+        )
+    return (*told, *doubts_about_the_frame(case, bones), *doubts_about_the_ends(case, bones))
 
 
 def doubts_about_the_ends(case: Case, bones: BoneLabels) -> tuple[str, ...]:

@@ -84,7 +84,7 @@ def prepare_scene(case: Case) -> Scene:
         if from_ct:
             ct, bones = read_bones(case)
             outlining = beside.submit(outline_of, bones, case.anatomy)
-            framing = beside.submit(doubts_about_the_files, case, bones)
+            framing = beside.submit(doubts_about_the_files, case, ct, bones)
             check_inside(case.landmarks, ct)
             told_of_ct = (*bones.notes, *_check_anatomy(case, ct, bones))
             _check_path(case, ct)

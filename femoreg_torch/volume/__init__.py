@@ -2,7 +2,7 @@
 
 from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
 from femoreg_torch.volume.bones import BoneLabels, bone_labels
-from femoreg_torch.volume.contradictions import densities, misplaced_labels
+from femoreg_torch.volume.contradictions import densities, misplaced_labels, shifted_labels
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
 from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
 from femoreg_torch.volume.guide_end import GuideEnd, guide_end
@@ -72,6 +72,7 @@ __all__ = [
     "scanned_device",
     "segment_names",
     "sharpened",
+    "shifted_labels",
     "solid_volumes",
     "stray_landmarks",
     "structure_attenuation",

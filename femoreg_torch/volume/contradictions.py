@@ -22,6 +22,9 @@ _REACH_MM = 18.0  # how far a label map is looked for: a best place beyond the f
 _BRIGHT_HU = 150.0, 550.0  # from here on a voxel is bone, from there on it is no more so
 _LEAST_SHIFT_MM, _MOST_SHIFT_MM = 2.5, 15.0
 _LEAST_GAIN = 0.15
+# Of the mean HU in the labels, by the shift, to that between where they lie and as far aside as is looked. Of 28 right
+# CTs of three simulators none was shifted at all; labels 3 and 4 mm aside rose by 2.1 and 5.1, 2 mm aside by 0.4.
+_QUICK_REACH_MM, _MOST_PLACES, _TOLD_HU, _LEAST_RISE = 6.0, 20_000, (-200.0, 800.0), 0.5
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,41 @@ def misplaced_labels(ct: Volume, labels: Volume, ids: Sequence[int]) -> str | No
         f"label map: would lie on the bright bones of the CT if it were moved by ({told}) mm LPS: does it belong to "
         "this CT, and do both headers say where the first voxel lies?"
     )
+
+
+def shifted_labels(ct: Volume, labels: Volume) -> Tensor | None:
+    """Shift (3,), mm LPS, by which a label map would lie on the bones of a CT on its grid; None where it lies there.
+
+    A quick look, axis by axis and some mm far, where the mean of the CT in the labels rises. `misplaced_labels` looks
+    farther.
+    """
+    size = torch.tensor(labels.data.shape)
+    reach = (_QUICK_REACH_MM / torch.tensor(labels.spacing_mm).flip(0)).long()
+    where = labels.data.nonzero()
+    where = where[:: 1 + len(where) // _MOST_PLACES]
+    where = where[((where >= reach) & (where < size - reach)).all(1)]
+    if not len(where):
+        return None
+    values, strides = ct.data.reshape(-1), torch.tensor([int(size[1] * size[2]), int(size[2]), 1])
+    places = where @ strides
+
+    def mean(shift: Tensor) -> float:
+        return float(values[places + int(shift @ strides)].clamp(*_TOLD_HU).float().mean())
+
+    steps = torch.eye(3, dtype=torch.long)
+    best = torch.zeros(3, dtype=torch.long)
+    for _ in range(2):
+        for axis in range(3):
+            apart = sorted(range(-int(reach[axis]), int(reach[axis]) + 1), key=abs)  # of equals, the nearest
+            best = max((best * (1 - steps[axis]) + n * steps[axis] for n in apart), key=mean)
+    here, found, opposite = mean(torch.zeros_like(best)), mean(best), mean(-best)
+    # The marrow within too small labels is darker than the cortex on either side of them.
+    if opposite > here - 0.25 * (found - here):
+        return None
+    aside = sum(mean(sign * reach[axis] * steps[axis]) for axis in range(3) for sign in (-1, 1)) / 6
+    shift = ct.lps_from_index[:3, :3] @ best.flip(0).double()
+    lies_there = float(shift.norm()) < _LEAST_SHIFT_MM or found - here < _LEAST_RISE * abs(here - aside)
+    return None if lies_there else shift
 
 
 def _steps(volume: Volume, apart_mm: float) -> tuple[slice, slice, slice]:

@@ -10,7 +10,11 @@ from torch import Tensor
 from femoreg_torch.case import Case, CaseObject
 from femoreg_torch.case.femoroplasty import planned
 from femoreg_torch.geometry import load_carm
-from femoreg_torch.registration.plan_and_landmarks import doubts_about_the_ends, doubts_about_the_frame
+from femoreg_torch.registration.plan_and_landmarks import (
+    doubts_about_the_ends,
+    doubts_about_the_files,
+    doubts_about_the_frame,
+)
 from femoreg_torch.volume import BoneLabels, Volume, axis_aligned
 
 HEADS = {"left": torch.tensor([88.0, -3.0, 4.0]).double(), "right": torch.tensor([-90.0, 2.0, 0.0]).double()}
@@ -67,6 +71,14 @@ def test_heads_beside_their_landmarks(left: tuple[float, ...], right: tuple[floa
     told = doubts_about_the_frame(case(HEADS["left"] + off[0], HEADS["right"] + off[1]), bones())
     assert len(told) == (says is not None)
     assert all(each.startswith(says or "") for each in told)
+
+
+def test_a_label_map_beside_the_bones_of_the_ct() -> None:
+    right, there = case(HEADS["left"], HEADS["right"]), bones()
+    ct = there.labels.with_data(torch.where(there.labels.data > 0, 400.0, 30.0))
+    assert doubts_about_the_files(right, ct, there) == ()
+    (told,) = doubts_about_the_files(right, ct.with_data(ct.data.roll(2, 1)), there)  # 4 mm
+    assert "if it were moved by (0, 4, 0) mm LPS" in told
 
 
 def test_a_label_map_of_shells_holds_no_middle_of_a_head() -> None:

@@ -2,8 +2,9 @@
 
 import pytest
 import torch
+from scipy import ndimage
 
-from femoreg_torch.volume import Volume, axis_aligned, densities, misplaced_labels
+from femoreg_torch.volume import Volume, axis_aligned, densities, misplaced_labels, shifted_labels
 
 IDS = (1, 2)
 
@@ -37,6 +38,7 @@ def test_what_belongs_together_is_not_doubted(spacing: tuple[float, float, float
     bare = ct.with_data(torch.where(labels.data > 0, ct.data, torch.tensor(-1000.0)))  # bones in air, as of a dry femur
     assert unasked(bare, labels)
     assert misplaced_labels(bare, labels, IDS) is None
+    assert shifted_labels(ct, labels) is shifted_labels(bare, labels) is None
 
 
 def test_bones_of_foam_with_a_hard_shell_are_not_doubted() -> None:
@@ -59,6 +61,25 @@ def test_an_intercept_that_is_missing_or_there_twice_is_told() -> None:
 def test_a_ct_without_bright_bone_tells_nothing_of_its_labels_place() -> None:
     ct, labels = ct_and_labels()
     assert misplaced_labels(ct.with_data(ct.data.clamp_max(100)), labels, IDS) is None
+
+
+@pytest.mark.parametrize("shift", [(3, 0, 0), (0, -3, 0), (0, 0, 4), (2, -2, 2)])
+def test_a_label_map_some_mm_aside_is_found_by_a_quick_look(shift: tuple[int, int, int]) -> None:
+    ct, labels = ct_and_labels()
+    aside = labels.with_data(labels.data.roll(shift, (2, 1, 0)))
+    found = shifted_labels(ct, aside)
+    assert found is not None
+    assert (found + torch.tensor(shift)).norm() < 1.1
+    near = labels.with_data(labels.data.roll((1, 1, -1), (2, 1, 0)))
+    assert shifted_labels(ct, near) is None
+
+
+@pytest.mark.parametrize("voxels", [-2, -1, 1, 2])
+def test_too_large_or_too_small_is_not_aside(voxels: int) -> None:
+    ct, labels = ct_and_labels()
+    change = ndimage.grey_dilation if voxels > 0 else ndimage.grey_erosion
+    other = change(labels.data.numpy(), size=2 * abs(voxels) + 1)
+    assert shifted_labels(ct, labels.with_data(torch.from_numpy(other))) is None
 
 
 @pytest.mark.parametrize("shift", [(4, 0, 0), (0, -8, 0), (3, 3, -11)])
