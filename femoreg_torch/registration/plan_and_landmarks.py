@@ -1,4 +1,4 @@
-"""Do landmarks and plan lie where CT and label map have the bones?
+"""Do CT, landmarks and plan lie where the label map has the bones?
 
 Images do not tell: they place the bones of the label map. Landmarks that lie some mm beside them still start the
 registration, and the planned path, which stands in their frame, ends beside the head by as much. The femoral heads are
