@@ -16,6 +16,7 @@ from femoreg_torch.volume.bones import nearest_voxel
 # 2.7 mm, and both heads alike by at most 1.0 mm.
 MOST_OFF_HEAD_MM = 5.0
 MOST_OFF_BONE_MM, _FAR_OFF_BONE_MM = 5.0, 12.0  # of an entry point or target, from the middle of the nearest voxel
+_NOT_ASKED_MM = 1.0  # of the head that the path ends in, or of the left one: the second takes a tenth of a second
 # Of both in one direction, besides half a voxel, and how far that may differ between them.
 _MOST_ALIKE_MM, _ALIKE_MM = 2.0, 2.0
 
@@ -57,12 +58,15 @@ def doubts_about_the_ends(case: Case, bones: BoneLabels) -> tuple[str, ...]:
 
 def doubts_about_the_frame(case: Case, bones: BoneLabels) -> tuple[str, ...]:
     """Landmarks of femoral heads that lie beside those of the label map, in words; none where these are no spheres."""
+    target = None if case.plan is None else case.plan.target
+    there = {f"FH-{side[0]}": side for side in ("left", "right") if f"FH-{side[0]}" in case.landmarks}
     off = {}
-    for side in ("left", "right"):
-        name = f"FH-{side[0]}"
-        centre = head_centre(bones, side, case.landmarks[name]) if name in case.landmarks else None
+    for name in sorted(there, key=lambda name: target is None or not torch.equal(case.landmarks[name], target)):
+        centre = head_centre(bones, there[name], case.landmarks[name])
         if centre is not None:
             off[name] = centre - case.landmarks[name]
+            if len(off) == 1 and float(off[name].norm()) < _NOT_ASKED_MM:
+                return ()  # so both cannot be off alike, and no path ends in the other one
     if len(off) == 2:
         one, other = off.values()
         alike = float((one + other).norm() / 2)
@@ -72,7 +76,6 @@ def doubts_about_the_frame(case: Case, bones: BoneLabels) -> tuple[str, ...]:
                 f"both femoral heads of the label map lie {alike:.1f} mm from FH-l and FH-r, in the same direction: "
                 "landmarks, and likely the plan, are not in the frame of CT and label map; check the origin of both",
             )
-    target = None if case.plan is None else case.plan.target
     return tuple(
         f"{name}, where the planned path ends, lies {float(away.norm()):.1f} mm from the middle of the femoral head of "
         "the label map: check that landmark, and that it is in the frame of the CT"
