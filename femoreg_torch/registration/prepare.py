@@ -423,7 +423,10 @@ def _field(
         field = image if field is None else field & image
     if field is not None:
         return without_penumbra(field, camera), words, None
-    shutter = find_shutter(raw, camera) or next((one for one in shutters if shades(one, raw, camera)), None)
+    if shutters:  # what this image shows by itself was looked for before
+        shutter = next((one for one in shutters if shades(one, raw, camera)), None)
+    else:
+        shutter = find_shutter(raw, camera)
     if shutter is None:
         blank = blank_lines(raw)
         if blank is None:
