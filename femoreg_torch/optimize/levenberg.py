@@ -1,5 +1,6 @@
 """Levenberg–Marquardt: steps of second order, damped until they improve; from one start or from the best of many."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,7 @@ _DAMPING = 1e-3  # at the start, relative to the curvature of each degree of fre
 _SOFTEST = 1e-4  # least curvature that counts, relative to the mean
 _LEAST_DAMPING = 1e-7
 _MOST_DAMPING = 1e4
+_SHORTER = 0.5  # times the length of a step that fits worse: the most of the next one
 _SOFT = 5  # directions that are looked along for the bottom of a valley
 _FLAT = 1e-9  # second difference of values that is none
 # Units of the scales: a descent that comes so near to where an earlier one ended, and lies higher, would end there.
@@ -24,6 +26,8 @@ class LevenbergMarquardt:
     """Settings of Levenberg–Marquardt with Nielsen's damping.
 
     K. Madsen, H. B. Nielsen, O. Tingleff, Methods for non-linear least squares problems, DTU 2004, algorithm 3.16.
+    After a step that fits worse, the damping rises until the next one is at most half as long: from little damping, one
+    step after another would lead to the same place.
     With `candidates`, so many random deltas of deviation one are looked at first, and the best `starts` of them and
     zero are refined; the search ends with the best of these. One that comes where an earlier one ended, and fits no
     better, is given up: it would end there too.
@@ -94,15 +98,16 @@ def _descend(
 ) -> _End | None:
     """Where a descent from one start leads; None if that is where an earlier one ended."""
     here, model = start, _quadratic(track, objective, start)
-    damping, growth = _DAMPING, 2.0
+    damping, growth, longest = _DAMPING, 2.0, math.inf
     for _ in range(settings.max_iterations):
         if any(model.value >= end.value and float((here - end.delta).norm()) < _SAME for end in earlier):
             return None
-        diagonal = model.hessian.diagonal()
-        # Marquardt's scaling: a stiff degree of freedom does not hold back a soft one, such as a small object's.
-        unit = diagonal.clamp(min=_SOFTEST * float(diagonal.mean()) + 1e-12)
-        damped = model.hessian + damping * unit.diag()
-        step = -torch.linalg.solve(damped, model.gradient)
+        step = _damped_step(model, damping)
+        while float(step.norm()) > longest:
+            damping, growth = damping * growth, growth * 2
+            if damping > _MOST_DAMPING:
+                return _End(Stop.ROUNDOFF, model.value, here, model.hessian)
+            step = _damped_step(model, damping)
         promised = float(-(model.gradient @ step) - 0.5 * step @ model.hessian @ step)
         if float(step.norm()) < settings.tol_x:
             return _End(Stop.SMALL_STEP, model.value, here, model.hessian)
@@ -113,12 +118,20 @@ def _descend(
         if ratio > 0:
             here, model = here + step, trial
             damping = max(_LEAST_DAMPING, damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3))
-            growth = 2.0
+            growth, longest = 2.0, math.inf
         else:
-            damping, growth = damping * growth, growth * 2
-            if damping > _MOST_DAMPING:
-                return _End(Stop.ROUNDOFF, model.value, here, model.hessian)
+            longest = _SHORTER * float(step.norm())
     return _End(Stop.BUDGET, model.value, here, model.hessian)
+
+
+def _damped_step(model: Quadratic, damping: float) -> torch.Tensor:
+    """The step (n,) to the minimum of the damped quadratic.
+
+    By Marquardt's scaling: a stiff degree of freedom does not hold back a soft one, such as a small object's.
+    """
+    diagonal = model.hessian.diagonal()
+    unit = diagonal.clamp(min=_SOFTEST * float(diagonal.mean()) + 1e-12)
+    return -torch.linalg.solve(model.hessian + damping * unit.diag(), model.gradient)
 
 
 def _in_the_valley(track: BestSoFar, result: Result, hessian: torch.Tensor, half_length: float) -> Result:

@@ -8,7 +8,6 @@ round, so that the label map by itself says where their middles are.
 import torch
 
 from femoreg_torch.case import Case
-from femoreg_torch.segment import head_centre
 from femoreg_torch.volume import BoneLabels, Volume, shifted_labels
 from femoreg_torch.volume.bones import nearest_voxel
 
@@ -58,6 +57,8 @@ def doubts_about_the_ends(case: Case, bones: BoneLabels) -> tuple[str, ...]:
 
 def doubts_about_the_frame(case: Case, bones: BoneLabels) -> tuple[str, ...]:
     """Landmarks of femoral heads that lie beside those of the label map, in words; none where these are no spheres."""
+    from femoreg_torch.segment import head_centre  # with trimesh, whose import the reading of CT and images hides
+
     target = None if case.plan is None else case.plan.target
     there = {f"FH-{side[0]}": side for side in ("left", "right") if f"FH-{side[0]}" in case.landmarks}
     off = {}

@@ -106,6 +106,27 @@ def test_a_parabola_over_the_valley_finds_its_bottom_beneath_the_ripples() -> No
     torch.testing.assert_close(torch.tensor(smooth.trace[-1][2], dtype=torch.float64), smooth.delta)
 
 
+def test_after_a_step_that_fits_worse_the_next_is_at_most_half_as_long() -> None:
+    objective = rippled(1e-2)
+    asked: list[tuple[Tensor, float]] = []
+
+    def watched(delta: Tensor) -> Quadratic:
+        model = objective.quadratic(delta)
+        asked.append((delta, model.value))
+        return model
+
+    LevenbergMarquardt(tol_x=1e-3).minimise(SmoothObjective(objective.values, watched), 2, seed=0)
+    (here, least), rejected, lengths = asked[0], 0, [float("inf")]
+    for delta, value in asked[1:]:
+        lengths.append(float((delta - here).norm()))
+        if value < least:
+            here, least, lengths = delta, value, [float("inf")]
+        else:
+            rejected += len(lengths) > 2
+            assert lengths[-1] <= lengths[-2] / 2 * (1 + 1e-9)
+    assert rejected, "no step was rejected twice, so nothing was asked"
+
+
 def test_where_nothing_holds_a_direction_no_parabola_is_followed() -> None:
     loose = squares(lambda d: torch.stack([d[0] - 1, 0 * d[1]]))
     result = LevenbergMarquardt(tol_f=1e-14, valley=0.4).minimise(loose, 2, seed=0)
