@@ -115,12 +115,20 @@ def plan_points(plan: Fields, folder: Path, side: Side | None = None) -> tuple[F
             raise InputError(f"{plan.where(key)}: stands in the `file` of the plan already. Keep one of them.")
     path = plan.file_path("file", folder)
     content = Fields(read_json(path), str(path))
+    check_frame(content)
     planned = content.content.get("side")
     if side is not None and planned not in (None, side):
         raise InputError(
             f"{plan.where('file')}: {path} is a plan for the {planned} femur, the case is of the {side} side."
         )
     return content.mapping("plan"), path
+
+
+def check_frame(plan: Fields) -> None:
+    """Raises `InputError` for the content of a `plan.json` that says of itself that it is not in LPS mm."""
+    for key, known in (("space", "LPS"), ("unit", "mm")):
+        if str(value := plan.content.get(key, known)).strip().lower() != known.lower():
+            raise InputError(f"{plan.where(key)}: {known} was expected, found {shortened(value)}.")
 
 
 def read_plan(

@@ -16,8 +16,9 @@ def plan(
     """Plan where cement is injected into a femur: entry point, direction, amounts, and the modelled gain.
 
     Writes into OUT: plan.json (path in the form that a case's `plan:` takes, injections, loads, settings),
-    cement.nii.gz and optimum.nii.gz (label maps on the CT's grid), cement.stl and path.stl, path.mrk.json for 3D
-    Slicer, fields.vtu, curves.png and overlay.png. Loads are modelled, not measured; no medical device.
+    cement.nii.gz and optimum.nii.gz (label maps of the CT's voxels, their axes in the order of LPS), cement.stl and
+    path.stl, path.mrk.json for 3D Slicer, fields.vtu, curves.png and overlay.png. Loads are modelled, not measured; no
+    medical device.
 
     Args:
         case: Folder with case.yaml, its CT, label map and landmarks.
@@ -35,7 +36,7 @@ def plan(
     from femoreg_torch.planning.figures import curves_figure, overlay_figure, save
     from femoreg_torch.planning.plan import make_plan
     from femoreg_torch.planning.prepare import prepare
-    from femoreg_torch.planning.report import write_plan
+    from femoreg_torch.planning.report import OF_A_PLAN, write_plan
     from femoreg_torch.planning.settings import load_planning
 
     console = Console()
@@ -46,7 +47,7 @@ def plan(
     prepared = prepare(content, load_planning(preset), device=place)
     with progress_report(console, "optimal cement") as report:
         found = make_plan(prepared, volume_ml, seed, report)
-    with new_folder(out) as folder:
+    with new_folder(out, without=OF_A_PLAN) as folder:
         write_plan(folder, content, prepared, found, seed)
         curves = {"without cement": found.baseline, "as planned": found.curve, "optimum": found.optimum_curve}
         save(curves_figure(curves), folder / "curves.png")

@@ -127,6 +127,7 @@ def register_into(
     from femoreg_torch.evaluation import EVALUATION_NAMES, REPLAY_NAMES, evaluate
     from femoreg_torch.files import check_new_folder
     from femoreg_torch.navigation import NAVIGATION_NAMES, navigation_content, read_robot, write_navigation
+    from femoreg_torch.neighbours.slicer import SCENE_FOLDER
     from femoreg_torch.registration.run import network_detector, register_scene, silent
 
     check_new_folder(out, case.folder)
@@ -160,7 +161,8 @@ def register_into(
         case=os.path.relpath(case.folder.resolve(), out.resolve()),
     )
     navigation = None if result.object_from_tool is None else navigation_content(result, calibration)
-    with new_folder(out, without=(*EVALUATION_NAMES, *NAVIGATION_NAMES, *REPLAY_NAMES, REVIEW_NAME)) as built:
+    of_the_result = (*EVALUATION_NAMES, *NAVIGATION_NAMES, *REPLAY_NAMES, REVIEW_NAME, SCENE_FOLDER)
+    with new_folder(out, without=of_the_result) as built:
         write_json(built / RESULT_NAME, result_content(result))
         if navigation is not None:
             write_navigation(built, navigation)

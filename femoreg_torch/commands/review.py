@@ -30,7 +30,7 @@ def review(
     Args:
         folder: Folder that `femoreg register` wrote, or a case folder.
         case: Case folder of a run, if it no longer stands where it stood, seen from the run, when it was registered.
-        out: Folder to write results to; needed for a case. By default that of the run, whose result is replaced.
+        out: Folder to write results to, for a case. Those of a run are written to it, and replace its own.
         preset: Workflow, see `femoreg register`.
         seed: Of the random searches.
         weights: Weights of the landmark network, if not those shipped (safetensors).
@@ -81,7 +81,11 @@ def _case_and_run(folder: Path, case: Path | None, out: Path | None) -> tuple[Pa
     from femoreg_torch.errors import InputError
 
     if (folder / RESULT_NAME).exists():
-        return case_of(folder, read_result(folder), case), out or folder
+        if out is not None:
+            raise InputError(
+                f"--out: {folder} is a run, and what is registered replaces it. Copy it to keep it as it is."
+            )
+        return case_of(folder, read_result(folder), case), folder
     folder = case_folder(folder)
     if not (folder / "case.yaml").exists():
         raise InputError(

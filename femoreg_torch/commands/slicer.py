@@ -13,20 +13,24 @@ def slicer(run: Path, *, case: Path | None = None, out: Path | None = None) -> N
     Args:
         run: Folder that `femoreg register` wrote.
         case: Case folder, if it no longer stands where it stood, seen from RUN, when it was registered.
-        out: Folder to write to; by default RUN/slicer. What stood in it stays, but for what is written anew.
+        out: Folder to write to. What stood in it stays, but for what is written anew. By default RUN/slicer, which goes
+            with the result: the next registration into RUN removes it.
     """
     from rich.console import Console
 
-    from femoreg_torch.case import RESULT_NAME, new_folder, read_case, read_result
-    from femoreg_torch.errors import InputError
-    from femoreg_torch.neighbours.slicer import SCENE_NAME, write_scene
+    from femoreg_torch.case import case_folder, new_folder, read_case, read_result
+    from femoreg_torch.commands.replay import case_of
+    from femoreg_torch.evaluation.fit import check_fits, check_plan_fits
+    from femoreg_torch.files import check_new_folder
+    from femoreg_torch.neighbours.slicer import SCENE_FOLDER, SCENE_NAME, write_scene
 
     result = read_result(run)
-    if case is None:
-        if result.case is None:
-            raise InputError(f"{run / RESULT_NAME}, case: missing. Name the case folder with --case.")
-        case = run / result.case
-    folder = run / "slicer" if out is None else out
+    of = case_folder(case_of(run, result, case))
+    folder = run / SCENE_FOLDER if out is None else out
+    check_new_folder(folder, of)
+    content = read_case(of)
+    check_fits(content, result)
+    check_plan_fits(content, result)
     with new_folder(folder) as built:
-        write_scene(built, read_case(case), result, standing=folder)
+        write_scene(built, content, result, standing=folder)
     Console().print(f"Scene written to {folder / SCENE_NAME}", markup=False, highlight=False, soft_wrap=True)

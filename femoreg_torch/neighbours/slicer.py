@@ -28,7 +28,7 @@ from femoreg_torch.volume import BoneLabels, Volume, write_landmarks
 if TYPE_CHECKING:
     import trimesh
 
-SCENE_NAME = "scene.mrml"
+SCENE_NAME, SCENE_FOLDER = "scene.mrml", "slicer"
 _BONE, _TOOL = (0.89, 0.85, 0.73), (0.35, 0.6, 0.85)
 _SMOOTH_PX = 0.7  # of a mask, before its surface is taken
 

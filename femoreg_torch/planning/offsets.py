@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 
 _MOST_BYTES = 2**16  # of a covariance as text
 _OTHER_SIDE = {"left": "right", "right": "left"}
+_NO_SIDE = ("", "nan", "none")  # as tables hold what is not told
 _MIRRORED = np.array([-1.0, 1, 1, 1, -1, -1])  # a shift, then a turn, of LPS, seen in a mirror of left and right
 _AXES = ("lr", "ap", "is")  # of a study's signed columns, as LPS: to the left, to the back, to the head
 
@@ -134,7 +135,7 @@ def read_covariance(file: File) -> Array:
     file = File(file)
     if file.name == RESULT_NAME:
         return _covariance_of(read_result(file.parent), file)
-    if file.suffix.lower() == ".json":
+    if file.suffix.lower() == ".json" and file.exists():
         raise InputError(f"{file}: a result is read by its name. Call it {RESULT_NAME}, in a folder of its own.")
     text = read_bytes(file, _MOST_BYTES).decode("utf-8", "replace")
     rows = [line.replace(",", " ").split() for line in text.splitlines() if line.strip()]
@@ -192,7 +193,10 @@ def study_moves(folder: File, side: Side, draws: int, seed: int) -> tuple[Array,
     if values.shape[1] > 6:
         found[:, 3:] = values[:, 6:9] - values[:, 9:]
     if "side" in table:
-        other = np.array([value == _OTHER_SIDE[side] for value in table["side"]], bool)[kept]
+        sides = np.array([str(value).strip().lower() for value in table["side"]])[kept]
+        if strange := sorted(set(sides.tolist()) - {*_OTHER_SIDE, *_NO_SIDE}):
+            raise InputError(f"{folder}: `side` of a run was to be left or right, found {shortened(strange[0])}.")
+        other = sides == _OTHER_SIDE[side]
         found[other] *= _MIRRORED
     return np.asarray(found[np.random.default_rng(seed).integers(len(found), size=draws)]), len(found)
 

@@ -11,6 +11,7 @@ import femoreg_torch
 from femoreg_torch.case import Case
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.model import Side
+from femoreg_torch.case.objects import check_frame
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json, temporary_file, write_json
 from femoreg_torch.planning.curve import Curve
@@ -25,6 +26,7 @@ from femoreg_torch.volume import read_label_map, write_volume
 Array = NDArray[np.float64]
 
 PLAN_NAME = "plan.json"
+OF_A_PLAN = ("offsets.json", "offsets.png", "robustness.json", "robustness.png")  # what is told of one afterwards
 CEMENT_NAME, OPTIMUM_NAME = "cement.nii.gz", "optimum.nii.gz"
 NOTICE = "Research software, not a medical device. Loads are those of a model that no test of bones has confirmed."
 
@@ -129,6 +131,7 @@ def read_plan(folder: File) -> StoredPlan:
         plan = Fields(content, where).mapping("plan")
         entry, target = (plan.point(key).numpy() for key in ("entry_point", "target"))
         loads = [Fields(content, where).mapping(key).number("yield_load_n") for key in ("baseline", "planned")]
+        check_frame(Fields(content, where))
         case = File(content["case"])
         side = cast(Side, Fields(content, where).choice("side", ("left", "right")))
     except InputError:

@@ -9,6 +9,8 @@ from femoreg_torch.configs import load_preset
 from femoreg_torch.errors import InputError
 from femoreg_torch.settings import read_record
 
+_COARSEST_MM = 10.0  # of elements and voxels; a femoral neck is some 30 mm thick
+
 
 @dataclass(frozen=True)
 class CalibrationSettings:
@@ -65,6 +67,7 @@ class MeshSettings:
 
     def __post_init__(self) -> None:
         _positive("mesh", size_mm=self.size_mm, shaft_mm=self.shaft_mm, most_elements=self.most_elements)
+        _at_most("mesh", _COARSEST_MM, size_mm=self.size_mm)
         if self.search_mm < self.size_mm:
             raise InputError(
                 f"mesh.search_mm: at least mesh.size_mm, {self.size_mm:g}, was expected, found {self.search_mm:g}."
@@ -211,6 +214,7 @@ class DiffusionSettings:
             solid_g_cc=self.solid_g_cc,
             rate_ml_min=self.rate_ml_min,
         )
+        _at_most("diffusion", _COARSEST_MM, voxel_mm=self.voxel_mm)
 
 
 @dataclass(frozen=True)
@@ -263,6 +267,12 @@ def _positive(group: str, **values: float) -> None:
     for key, value in values.items():
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{group}.{key}: a number above 0 was expected, found {value:g}.")
+
+
+def _at_most(group: str, most: float, **values: float) -> None:
+    for key, value in values.items():
+        if value > most:
+            raise InputError(f"{group}.{key}: at most {most:g} was expected, found {value:g}.")
 
 
 def _not_negative(group: str, **values: float) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from femoreg_torch.case import read_case
 from femoreg_torch.case.inputs import inputs_digest
+from femoreg_torch.errors import InputError
 
 CASE = """\
 version: 2
@@ -108,3 +109,14 @@ def test_other_files_and_settings_count(tmp_path: Path) -> None:
     weights.write_text("2", encoding="utf-8")
     found += [inputs_digest(case, {"weights": weights})]
     assert len(set(found)) == len(found)
+
+
+@pytest.mark.parametrize(("key", "value", "known"), [("space", "RAS", "LPS"), ("unit", "m", "mm")])
+def test_a_plan_in_another_space_or_unit_is_refused(key: str, value: str, known: str, tmp_path: Path) -> None:
+    folder = write(tmp_path)
+    plan = FILES["plans/plan.json"]
+    (tmp_path / "plans" / "plan.json").write_text(f'{{"{key}": "{value}", {plan[1:]}', encoding="utf-8")
+    with pytest.raises(InputError, match=rf"plan\.json, {key}: {known} was expected, found '{value}'"):
+        read_case(folder)
+    (tmp_path / "plans" / "plan.json").write_text(f'{{"{key}": "{known.upper()}", {plan[1:]}', encoding="utf-8")
+    read_case(folder)

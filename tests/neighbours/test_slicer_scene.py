@@ -5,10 +5,24 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import tifffile
 import torch
 import trimesh
 
-from femoreg_torch.case import Case, CaseObject, Model, PlannedPath, Result, Start
+from femoreg_torch.case import (
+    Case,
+    CaseObject,
+    Model,
+    PlannedPath,
+    Result,
+    Start,
+    View,
+    result_content,
+    write_case,
+    write_json,
+)
+from femoreg_torch.case.result import path_in_camera1
+from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json
 from femoreg_torch.geometry import Poses, exp_se3, invert_rigid, load_carm
@@ -85,3 +99,53 @@ def test_a_surface_lies_where_its_mask_does_whatever_the_axes(sign: float) -> No
     assert mesh.volume > 0
     with pytest.raises(InputError, match="box: has no voxel"):
         surface_of(Volume(torch.zeros(3, 3, 3), affine), "box")
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run of a case of a block with a planned path, whose model stands in the case's folder."""
+    folder = tmp_path / "case"
+    folder.mkdir()
+    trimesh.creation.box((12, 9, 7)).export(folder / "block.stl")
+    tifffile.imwrite(folder / "view1.tif", np.zeros((8, 8), np.uint16))
+    block = CaseObject("block", model=Model(folder / "block.stl", 500.0), start=Start(pose(1)))
+    plan = PlannedPath("block", torch.tensor([1.0, 2, 3], dtype=float64), torch.zeros(3, dtype=float64), None)
+    case = Case(folder, load_carm("cios_fusion"), {"block": block}, (View({"image": folder / "view1.tif"}),), plan=plan)
+    write_case(folder, case)
+    poses = Poses(torch.eye(4, dtype=float64)[None], {"block": pose(1)})
+    points, directions = path_in_camera1(case, poses)
+    (tmp_path / "run").mkdir()
+    result = Result(poses, {}, points_camera1=points, directions_camera1=directions, case="../case")
+    write_json(tmp_path / "run" / "result.json", result_content(result))
+    return tmp_path / "run"
+
+
+def test_a_scene_is_written_beside_the_result_and_not_over_the_models_of_the_case(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case, model = run.parent / "case", (run.parent / "case" / "block.stl").read_bytes()
+    assert main(["slicer", str(run)]) == 0
+    assert (run / "slicer" / "scene.mrml").is_file()
+    assert main(["slicer", str(run), "--out", str(case)]) == 2
+    assert "is the folder that is read" in capsys.readouterr().err
+    assert (case / "block.stl").read_bytes() == model
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"entry_point: [1.0": "entry_point: [5.0"}, "its entry point is another one"),
+        ({"block:": "brick:", "object: block": "object: brick"}, "has an object 'block'"),
+    ],
+)
+def test_a_scene_of_another_case_is_refused(
+    changes: dict[str, str], told: str, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = run.parent / "case" / "case.yaml"
+    text = file.read_text(encoding="utf-8")
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    file.write_text(text, encoding="utf-8")
+    assert main(["slicer", str(run)]) == 2
+    assert told in capsys.readouterr().err
+    assert not (run / "slicer").exists()

@@ -316,6 +316,7 @@ def test_presets_are_checked(tmp_path: Path) -> None:
         ("path: {target_mm: -3}", r"path\.target_mm: 0 or more"),
         ("distribution: {clearance_mm: -1}", r"distribution\.clearance_mm: 0 or more"),
         ("offsets: {distance_mm: 0}", r"offsets\.distance_mm: a number above 0"),
+        ("diffusion: {voxel_mm: 20}", r"diffusion\.voxel_mm: at most 10 was expected, found 20"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(tmp_path: Path, change: str, told: str) -> None:

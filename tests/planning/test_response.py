@@ -193,6 +193,13 @@ def test_moves_of_a_study_are_those_of_its_trusted_runs(tmp_path: File, suffix: 
     write_runs(tmp_path, columns, suffix)
     mirrored = np.tile([-1.5, 1.5, 1.5, 0, -0.1, -0.2], (9, 1))
     np.testing.assert_allclose(study_moves(tmp_path, "left", 9, 0)[0], mirrored, atol=1e-12)
+    columns["side"] = ["Right ", "left", "RIGHT"]
+    write_runs(tmp_path, columns, suffix)
+    np.testing.assert_allclose(study_moves(tmp_path, "left", 9, 0)[0], mirrored, atol=1e-12)
+    columns["side"] = ["right", "left", "r"]
+    write_runs(tmp_path, columns, suffix)
+    with pytest.raises(InputError, match="left or right, found 'r'"):
+        study_moves(tmp_path, "left", 1, 0)
     columns["side"] = ["", "left", None]  # not told
     write_runs(tmp_path, columns, suffix)
     as_it_is = np.tile([1.5, 1.5, 1.5, 0, 0.1, 0.2], (9, 1))

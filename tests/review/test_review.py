@@ -15,6 +15,7 @@ from starlette.testclient import TestClient
 
 from femoreg_torch.case import Case, read_result, result_content, write_json
 from femoreg_torch.case.review import REVIEW_NAME, Review, read_review, result_sha256, write_review
+from femoreg_torch.commands.main import main
 from femoreg_torch.commands.review import register_order
 from femoreg_torch.errors import InputError
 from femoreg_torch.registration import Scene
@@ -284,3 +285,11 @@ def test_there_is_nothing_to_cancel(client: TestClient) -> None:
     answer = client.post(f"/{TOKEN}/cancel", json={})
     assert answer.status_code == 409
     assert "No registration is running" in answer.json()["message"]
+
+
+def test_a_run_is_not_shown_while_another_folder_is_written_to(
+    run: Path, drawn_case: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["review", str(run), "--case", str(drawn_case), "--out", str(tmp_path / "new")]) == 2
+    assert "--out: " in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
