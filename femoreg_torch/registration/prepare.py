@@ -51,6 +51,7 @@ from femoreg_torch.volume import (
     label_box_centre,
     landmarks_without_bones,
     merged_bones,
+    mostly_stray,
     read_ct_told,
     read_labels_told,
     resample_isotropic,
@@ -134,7 +135,8 @@ def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]
 
     Raises `InputError` if they and the landmarks contradict one another.
     """
-    told = swapped_sides(bones, case.landmarks, case.anatomy) or merged_bones(bones, case.landmarks, case.anatomy)
+    asked = bones, case.landmarks, case.anatomy
+    told = swapped_sides(*asked) or merged_bones(*asked) or mostly_stray(*asked)
     seen = densities(ct, bones.labels)
     if wrong := [*told, *filter(None, [seen.unscaled])]:
         raise InputError(f"{case.folder}: {'; '.join(wrong)}.")

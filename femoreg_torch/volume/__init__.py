@@ -26,6 +26,7 @@ from femoreg_torch.volume.sides import (
     landmarks_beside_bones,
     landmarks_without_bones,
     merged_bones,
+    mostly_stray,
     stray_landmarks,
     swapped_sides,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "looked_up",
     "merged_bones",
     "misplaced_labels",
+    "mostly_stray",
     "read_bodies",
     "read_ct",
     "read_ct_told",

@@ -1,6 +1,6 @@
 """Do label map and landmarks tell left from right, and do they lie on one another? Patient space says what left is."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from femoreg_torch.volume.labels import label_box_centre
 
 _CLOSER_MM, _FAR_MM = 2.0, 30.0
 _ON_MM, _OFF_MM = 2.0, 6.0  # so near to a bone a landmark lies on it, and so far away it does not
+_ACROSS_MM = 12.0  # labels leak across a symphysis or into a joint by less
 _BESIDE_MM = 5.0  # seen of 17 right cases: at most 1.3; those that people place are 2 to 3 mm off
 _RAS = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
 
@@ -48,7 +49,21 @@ def swapped_sides(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: A
                 else "Exchange the endings -l and -r"
             )
         )
+    elif crossed := _crossed(bones, landmarks, anatomy, other):
+        told.append(
+            f"landmarks: {', '.join(crossed)} lie{'s' * (len(crossed) == 1)} on the other side. Exchange the endings "
+            "-l and -r there, or place them anew"
+        )
     return told
+
+
+def mostly_stray(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy | None) -> list[str]:
+    """What `stray_landmarks` tells, if it is of more than half of the landmarks: no pose can come of them."""
+    if anatomy is None:
+        return []
+    asked = [mark.name for mark in anatomy.landmarks if mark.name in landmarks and mark.bone in bones.ids]
+    near = sum(len(names) for names in _votes(bones, landmarks, anatomy))
+    return stray_landmarks(bones, landmarks, anatomy) if 2 * near < len(asked) else []
 
 
 def stray_landmarks(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy | None) -> list[str]:
@@ -126,6 +141,13 @@ def merged_bones(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: An
                     "both as one, or parts of one under the other's id? Part them"
                 )
     return told
+
+
+def _crossed(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy, other: Sequence[str]) -> list[str]:
+    """Those of the landmarks on `other` sides that are far from their own bone; at the symphysis both sides are near."""
+    bone_of = {mark.name: mark.bone for mark in anatomy.landmarks}
+    near = {name: nearest_voxel(bones.labels, [bones.ids[bone_of[name]]], landmarks[name]) for name in other}
+    return [name for name, found in near.items() if found is None or found[1] > _ACROSS_MM]
 
 
 def _mixed_up(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy) -> bool:

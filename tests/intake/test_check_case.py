@@ -312,6 +312,31 @@ def test_the_registration_refuses_swapped_sides_and_tells_what_was_done_to_a_lab
         prepare_scene(read_case(folder))
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"MOF-l": "MOF-r", "MOF-r": "MOF-l"}, "MOF-l, MOF-r lie on the other side. Exchange"),
+        ({"GSN-r": "GSN-l"}, "GSN-r lies on the other side. Exchange"),
+        (0.1, "lie far from the bones"),  # in cm
+    ],
+)
+def test_the_registration_refuses_landmarks_on_other_bones(
+    change: dict[str, str] | float, told: str, files: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    write_content(folder, case_content())
+    at = landmarks()
+    if isinstance(change, dict):
+        at |= {name: at[other] for name, other in change.items()}
+    else:
+        at = {name: tuple(change * x for x in point) for name, point in at.items()}
+    (folder / "landmarks.mrk.json").write_text(markups(at), encoding="utf-8")
+    with pytest.raises(InputError, match=told):
+        prepare_scene(read_case(folder))
+    assert any(told in one for one in check_case(folder, find_start=False).problems)
+
+
 def test_what_is_no_case_is_told(tmp_path: Path) -> None:
     assert "holds no case.yaml" in check_case(tmp_path).problems[0]
     (tmp_path / "case.yaml").write_text("- a list", encoding="utf-8")
