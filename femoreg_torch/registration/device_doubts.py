@@ -28,6 +28,7 @@ _AS_GOOD_ELSEWHERE = 0.37
 # Of a guide's line beside the end of its model, and off the middle of that end: the slanted end of a thick needle lies
 # 1.6 mm to one side. Of 30 right devices none passed beside it, and none more than 0.1 mm off the middle.
 _MOST_ASIDE_MM, _MOST_OFF_MIDDLE_MM = 0.5, 2.0
+_FAR_MM = 2.5  # lengths that a tip is looked for end at 4 mm: tips 8 and 12 mm off were found 2.8 to 3.5 mm off
 # Of a tip beside that of its model, mm, and what a model of that length gains of the similarity near the tip.
 # Seen of 38 right devices of two foreign simulators: at most 0.54 mm and 0.002. Of nine tips 2 to 4 mm off, eight were
 # told: five by 1.1 to 3.3 mm and 0.016 to 0.22, and three, whose end the estimate had emptied, by the model as told
@@ -123,8 +124,9 @@ def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imagi
             )
         off = _tip_elsewhere(case, told, scene, poses, name, kind, imaging)
         if off is not None:
+            more = " or more" if abs(off.longer_mm) > _FAR_MM else ""
             words.append(
-                f"the guide of the {name} end {abs(off.longer_mm):.1f} mm "
+                f"the guide of the {name} end {abs(off.longer_mm):.1f} mm{more} "
                 f"{'beyond' if off.longer_mm > 0 else 'before'} the tip of its model"
             )
         if words:

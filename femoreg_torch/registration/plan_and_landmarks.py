@@ -34,19 +34,27 @@ def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels) -> tuple[s
 
 
 def doubts_about_the_ends(case: Case, bones: BoneLabels) -> tuple[str, ...]:
-    """Entry points and targets a little outside the planned bone of the label map, in words.
+    """Entry points and targets a little outside the planned bone of the label map, or on its mirror, in words.
 
-    What is far outside is told by its attenuation, which knows no edge to a millimetre (`doubts_about_the_plan`).
+    What else is far outside is told by its attenuation, which knows no edge to a millimetre (`doubts_about_the_plan`).
     """
     plan = case.plan
     if plan is None or not case.objects[plan.object].bones:
         return ()
     ids = bones.of(case.objects[plan.object].bones, case.anatomy)
+    mirrors = {bone.mirror: bone.name for bone in case.anatomy.bones} if case.anatomy is not None else {}
+    across = {bones.ids[name]: name for name, of in mirrors.items() if name in bones.ids and bones.ids.get(of) in ids}
     told = []
     for name, point in (("entry point", plan.entry_point), ("target", plan.target)):
         if any(torch.equal(point, landmark) for landmark in case.landmarks.values()):
             continue  # the middle of a head: the label map may hold the shells of bones alone
         near = nearest_voxel(bones.labels, ids, point)
+        other = nearest_voxel(bones.labels, list(across), point) if across and near is None else None
+        if other is not None and other[1] <= MOST_OFF_BONE_MM:
+            told.append(
+                f"the planned {name} lies on the {across[other[0]]}, and the {plan.object} is that of the other side: "
+                "check `side` and the plan"
+            )
         if near is not None and MOST_OFF_BONE_MM < near[1] <= _FAR_OFF_BONE_MM:
             told.append(
                 f"the planned {name} lies {near[1]:.0f} mm outside the {plan.object}: check `plan`; its points are LPS "

@@ -17,7 +17,7 @@ from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.detect import detect, load_network
 from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.geometry import check_rigid
+from femoreg_torch.geometry import CArm, Poses, check_rigid
 from femoreg_torch.registration.doubts import doubts
 from femoreg_torch.registration.kernels import load_kernels
 from femoreg_torch.registration.plan import Plan, load_plan
@@ -169,7 +169,12 @@ def register_scene(
         doubts=against,
         start=began,
         stages=tuple(outcome.trace),
-        skipped=(*scene.missing, *outcome.skipped, *_unchecked(case, scene, began)),
+        skipped=(
+            *scene.missing,
+            *outcome.skipped,
+            *_unchecked(case, scene, began),
+            *notes_on_the_carm(case.carm, outcome.poses),
+        ),
         path=None if case.plan is None else (case.plan.object, case.plan.tool),
         points_camera1=points,
         directions_camera1=directions,
@@ -194,6 +199,19 @@ def _unchecked(case: Case, scene: Scene, start: StartRecord) -> tuple[str, ...]:
         return ()
     told = "" if scene.outline is not None else ", as the label map does not tell them apart"
     return (f"the start ({start.source}) was not compared with the outlines of the bones{told}",)
+
+
+def notes_on_the_carm(carm: CArm, poses: Poses) -> tuple[str, ...]:
+    """Whether a refinement moved the source distance of the C-arm's file, in words."""
+    factor = max((change.sdd_factor for change in poses.changes), key=lambda each: abs(each - 1), default=1.0)
+    if factor == 1.0:
+        return ()
+    told = carm.camera.sdd_mm
+    return (
+        f"the images moved the source distance from the {told:.0f} mm of the C-arm's file to {factor * told:.0f} mm, "
+        "and all objects with it in depth; where they lie beside each other hardly changes by that. If the C-arm was "
+        "calibrated, tell its `uncertainty`",
+    )
 
 
 def _started_at(scene: Scene, start: Mapping[str, Tensor]) -> Scene:

@@ -144,7 +144,7 @@ def merged_bones(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: An
 
 
 def _crossed(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy, other: Sequence[str]) -> list[str]:
-    """Those of the landmarks on `other` sides that are far from their own bone; at the symphysis both sides are near."""
+    """Landmarks on `other` sides that are far from their own bone; at the symphysis both sides are near."""
     bone_of = {mark.name: mark.bone for mark in anatomy.landmarks}
     near = {name: nearest_voxel(bones.labels, [bones.ids[bone_of[name]]], landmarks[name]) for name in other}
     return [name for name, found in near.items() if found is None or found[1] > _ACROSS_MM]

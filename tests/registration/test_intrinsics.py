@@ -17,6 +17,7 @@ from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, doubted, dou
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, image_quadratic, stage_objective
 from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance
+from femoreg_torch.registration.run import notes_on_the_carm
 from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, moved, reference_point_in_view
 from femoreg_torch.registration.stage import BodyPlan, Stage, run_stage
 from femoreg_torch.similarity import GradNcc
@@ -303,6 +304,17 @@ def test_a_source_distance_that_refinement_moved_far_is_told(scene: Scene, facto
     told = doubts_about_the_carm(scene, poses, covariance, Limits(), AS_SEEN)
     assert len(told) == doubted
     assert all(f"to {factor * CARM.camera.sdd_mm:.0f} mm" in sentence for sentence in told)
+
+
+def test_a_source_distance_that_was_refined_is_noted(scene: Scene) -> None:
+    poses = true_poses()
+    assert notes_on_the_carm(scene.carm, poses) == ()
+    changed = poses.with_changes((CameraChange(1.02, (0.0, 0.0)),) * scene.views)
+    (note,) = notes_on_the_carm(scene.carm, changed)
+    assert f"from the {scene.carm.camera.sdd_mm:.0f} mm of the C-arm's file" in note
+    assert f"to {1.02 * scene.carm.camera.sdd_mm:.0f} mm" in note
+    shifted = poses.with_changes((CameraChange(1.0, (1.0, 0.0)),) * scene.views)
+    assert notes_on_the_carm(scene.carm, shifted) == ()
 
 
 def test_a_wrong_file_that_was_not_refined_is_not_trusted(scene: Scene) -> None:

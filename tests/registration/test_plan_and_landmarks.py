@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from femoreg_torch.anatomy import HIP
 from femoreg_torch.case import Case, CaseObject
 from femoreg_torch.case.femoroplasty import planned
 from femoreg_torch.geometry import load_carm
@@ -53,6 +54,14 @@ def test_an_entry_point_outside_the_bone(beside_mm: float, told: int) -> None:
     found = doubts_about_the_ends(replace(right, plan=replace(right.plan, entry_point=entry)), bones())
     assert len(found) == told
     assert all(each.startswith("the planned entry point lies") for each in found)
+
+
+def test_a_plan_in_the_other_femur() -> None:
+    right = replace(case(HEADS["left"], HEADS["right"]), anatomy=HIP)
+    assert right.plan is not None
+    entry = HEADS["right"] - torch.tensor([14.0, 0, 50], dtype=torch.float64)
+    (told,) = doubts_about_the_ends(replace(right, plan=replace(right.plan, entry_point=entry)), bones())
+    assert told.startswith("the planned entry point lies on the femur_right, and the femur is that of the other side")
 
 
 @pytest.mark.parametrize(
