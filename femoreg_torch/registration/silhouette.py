@@ -18,7 +18,7 @@ from femoreg_torch.geometry import Camera, about_point, exp_se3, twist_rates
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective
 from femoreg_torch.registration.scene import Outline, Segmentation
 from femoreg_torch.registration.weights import dilated
-from femoreg_torch.volume import BoneLabels, looked_up, resample_isotropic
+from femoreg_torch.volume import BoneLabels, Volume, looked_up, resample_isotropic
 
 _SPACING_MM = 2.5  # of the mask and of the steps through it
 _OPAQUE_MM = 2.0  # path in bone after which a pixel is labelled with probability 1 − 1/e; labels begin at 1.5 mm
@@ -27,6 +27,8 @@ _OPAQUE_MM = 2.0  # path in bone after which a pixel is labelled with probabilit
 _PIXEL_DEVIATION = 1.0
 _BAND_MM = 15.0  # on the detector, about the bone that is seen; further off a shutter may hide what is drawn
 _HIDDEN_MARGIN_MM = 3.0
+_BEYOND_MM, _BOX_MM = 200.0, 5.0  # a CT that cuts the bones: how far they may go on, and how finely that is drawn
+_CUT = 0.3  # of the mask on the CT's border, from which a bone is cut there
 _STEP = 1e-5  # of a twist in standard deviations, for derivatives of the pose
 _SEARCH = LevenbergMarquardt(max_iterations=15, tol_x=0.02, tol_f=0.01, candidates=60, starts=3)
 
@@ -75,9 +77,11 @@ def refine_by_silhouette(
 
     `covariance` (6, 6) of the start is about `centre` (3,), mm in the camera frame. `attenuation` (H, W) of `camera` is
     the image; outside its exposed `field` (H, W), bool, and where it stands at its least or greatest value (shutters,
-    saturation) nothing is compared, nor where the segmentation sees bones that may hide those of the outline.
+    saturation) nothing is compared, nor where the segmentation sees bones that may hide those of the outline, nor, of
+    a CT that cuts these, what lies beyond it.
     """
-    looked_at = _looked_at(seen, outline, anatomy, attenuation, camera, field).flatten().nonzero()[:, 0]
+    looked_at = _looked_at(seen, outline, anatomy, attenuation, camera, field)
+    looked_at = (looked_at & ~_beyond(outline.mask, camera_from_ct, seen.camera)).flatten().nonzero()[:, 0]
     target = seen.probabilities[list(anatomy.classes(outline.bones))].sum(0).flatten()[looked_at].double()
     root = torch.linalg.cholesky(covariance.double())  # twist = root · u, with u of unit variance
 
@@ -136,3 +140,25 @@ def _looked_at(
     extreme = to_network_grid(((attenuation <= low) | (attenuation >= high) | ~field).float(), camera)
     covered = F.interpolate(extreme[None, None], seen.camera.shape, mode="area")[0, 0] > 0.5
     return near & ~hidden & ~dilated(covered, _HIDDEN_MARGIN_MM, seen.camera)
+
+
+def _beyond(mask: Volume, camera_from_ct: Tensor, camera: Camera) -> Tensor:
+    """Pixels (h, w) of a camera that see what lies beyond those faces of a CT that cut the bones of its mask."""
+    size = torch.tensor(mask.data.shape).flip(0) * torch.tensor(mask.spacing_mm)
+    found = torch.zeros(camera.shape, dtype=torch.bool, device=mask.data.device)
+    for axis in range(3):
+        for end, face in ((-1, mask.data.select(2 - axis, 0)), (1, mask.data.select(2 - axis, -1))):
+            if float(face.max()) <= _CUT:
+                continue
+            extent, first = size.clone(), torch.zeros(3, dtype=torch.float64)
+            extent[axis], first[axis] = _BEYOND_MM, (-_BEYOND_MM if end < 0 else float(size[axis]))
+            counts = (extent / _BOX_MM).ceil().long()
+            step = extent / counts  # of a voxel
+            affine = mask.lps_from_index.clone()
+            affine[:3, :3] = affine[:3, :3] / torch.tensor(mask.spacing_mm) * step
+            corner = mask.lps_from_index[:3, :3] @ (first / torch.tensor(mask.spacing_mm) - 0.5)
+            affine[:3, 3] = mask.lps_from_index[:3, 3] + corner + affine[:3, :3] @ torch.full((3,), 0.5).double()
+            box = Volume(torch.ones(counts.flip(0).tolist(), device=mask.data.device), affine)
+            path = project([box], camera_from_ct[None, None], camera, _BOX_MM)[0]
+            found |= dilated(path > _BOX_MM, _HIDDEN_MARGIN_MM, camera)
+    return found

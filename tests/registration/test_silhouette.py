@@ -94,6 +94,23 @@ def test_a_start_far_off_is_brought_near(seen: Tensor, shutter: int) -> None:
     assert (fit.covariance.diagonal() < covariance.diagonal()).all()
 
 
+def test_what_the_image_shows_beyond_a_short_ct_is_not_compared(seen: Tensor) -> None:
+    whole = labels(2.0)
+    short = Volume(whole.data[:65], whole.lps_from_index)  # up to 9 mm: the wings go on to 90
+    cut = outline_of(BoneLabels(short, {"hip_left": 1, "hip_right": 2}), HIP)
+    assert cut is not None
+    covariance = torch.diag(torch.tensor([0.08, 0.08, 0.04, 3, 3, 20], dtype=torch.float64) ** 2)
+    bones = Segmentation(seen, network_camera(CAMERA).downsampled(2))
+    image = torch.rand(CAMERA.shape, generator=torch.Generator().manual_seed(1))
+    fit = refine_by_silhouette(cut, HIP, off_by(5.0, 15.0), CENTRE, covariance, bones, image, CAMERA)
+    assert fit.overlap > 0.94
+    assert errors(fit.camera_from_ct)[0] < 3.5
+    stretched = outline_of(BoneLabels(Volume(labels(2.0, 0.7).data[:65], whole.lps_from_index), {"hip_left": 1}), HIP)
+    assert stretched is not None
+    other = refine_by_silhouette(stretched, HIP, TRUTH, CENTRE, covariance, bones, image, CAMERA)
+    assert other.overlap < 0.8
+
+
 def detection(seen: Tensor, points: Tensor) -> Detection:
     ones = torch.ones(len(points), dtype=torch.float64)
     pixels = project_points(CAMERA, transform_points(TRUTH, points))
