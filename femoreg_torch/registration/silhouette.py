@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from femoreg_torch.anatomy import Anatomy
 from femoreg_torch.detect import to_network_grid
 from femoreg_torch.drr import project, project_with_jacobian
-from femoreg_torch.geometry import Camera, about_point, exp_se3, twist_rates
+from femoreg_torch.geometry import Camera, about_point, exp_se3, transform_points, twist_rates
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective
 from femoreg_torch.registration.scene import Outline, Segmentation
 from femoreg_torch.registration.weights import dilated
@@ -142,23 +142,26 @@ def _looked_at(
     return near & ~hidden & ~dilated(covered, _HIDDEN_MARGIN_MM, seen.camera)
 
 
+def cut_faces(mask: Volume) -> list[tuple[int, bool]]:
+    """The faces of a CT that cut the bones of its mask: axis (0 is x of the index), and whether it is the last one."""
+    faces = [(axis, last) for axis in range(3) for last in (False, True)]
+    return [(axis, last) for axis, last in faces if float(mask.data.select(2 - axis, -int(last)).max()) > _CUT]
+
+
 def _beyond(mask: Volume, camera_from_ct: Tensor, camera: Camera) -> Tensor:
     """Pixels (h, w) of a camera that see what lies beyond those faces of a CT that cut the bones of its mask."""
-    size = torch.tensor(mask.data.shape).flip(0) * torch.tensor(mask.spacing_mm)
+    spacing = torch.tensor(mask.spacing_mm, dtype=torch.float64)
+    size = torch.tensor(mask.data.shape).flip(0) * spacing
     found = torch.zeros(camera.shape, dtype=torch.bool, device=mask.data.device)
-    for axis in range(3):
-        for end, face in ((-1, mask.data.select(2 - axis, 0)), (1, mask.data.select(2 - axis, -1))):
-            if float(face.max()) <= _CUT:
-                continue
-            extent, first = size.clone(), torch.zeros(3, dtype=torch.float64)
-            extent[axis], first[axis] = _BEYOND_MM, (-_BEYOND_MM if end < 0 else float(size[axis]))
-            counts = (extent / _BOX_MM).ceil().long()
-            step = extent / counts  # of a voxel
-            affine = mask.lps_from_index.clone()
-            affine[:3, :3] = affine[:3, :3] / torch.tensor(mask.spacing_mm) * step
-            corner = mask.lps_from_index[:3, :3] @ (first / torch.tensor(mask.spacing_mm) - 0.5)
-            affine[:3, 3] = mask.lps_from_index[:3, 3] + corner + affine[:3, :3] @ torch.full((3,), 0.5).double()
-            box = Volume(torch.ones(counts.flip(0).tolist(), device=mask.data.device), affine)
-            path = project([box], camera_from_ct[None, None], camera, _BOX_MM)[0]
-            found |= dilated(path > _BOX_MM, _HIDDEN_MARGIN_MM, camera)
+    for axis, last in cut_faces(mask):
+        extent, first = size.clone(), torch.zeros(3, dtype=torch.float64)  # mm along the axes, from the CT's corner
+        extent[axis], first[axis] = _BEYOND_MM, size[axis] if last else -_BEYOND_MM
+        counts = (extent / _BOX_MM).ceil()
+        affine = mask.lps_from_index.clone()
+        affine[:3, :3] *= extent / counts / spacing
+        corner = transform_points(mask.lps_from_index, (first / spacing - 0.5)[None])[0]
+        affine[:3, 3] = corner + affine[:3, :3].sum(1) / 2
+        box = Volume(torch.ones(counts.flip(0).int().tolist(), device=mask.data.device), affine)
+        path = project([box], camera_from_ct[None, None], camera, _BOX_MM)[0]
+        found |= dilated(path > _BOX_MM, _HIDDEN_MARGIN_MM, camera)
     return found

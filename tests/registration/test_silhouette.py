@@ -20,8 +20,8 @@ from femoreg_torch.geometry import (
     transform_points,
 )
 from femoreg_torch.registration.scene import Outline, Segmentation
-from femoreg_torch.registration.silhouette import outline_of, refine_by_silhouette
-from femoreg_torch.registration.start import find_start
+from femoreg_torch.registration.silhouette import cut_faces, outline_of, refine_by_silhouette
+from femoreg_torch.registration.start import LEAST_OVERLAP, find_start
 from femoreg_torch.volume import BoneLabels, Volume, axis_aligned
 
 CAMERA = centred_camera(1020.0, (0.776, 0.776), (384, 384))
@@ -105,10 +105,13 @@ def test_what_the_image_shows_beyond_a_short_ct_is_not_compared(seen: Tensor) ->
     fit = refine_by_silhouette(cut, HIP, off_by(5.0, 15.0), CENTRE, covariance, bones, image, CAMERA)
     assert fit.overlap > 0.94
     assert errors(fit.camera_from_ct)[0] < 3.5
-    stretched = outline_of(BoneLabels(Volume(labels(2.0, 0.7).data[:65], whole.lps_from_index), {"hip_left": 1}), HIP)
+    narrow = Volume(labels(2.0, 0.7).data[:65], whole.lps_from_index)
+    stretched = outline_of(BoneLabels(narrow, {"hip_left": 1, "hip_right": 2}), HIP)
     assert stretched is not None
     other = refine_by_silhouette(stretched, HIP, TRUTH, CENTRE, covariance, bones, image, CAMERA)
-    assert other.overlap < 0.8
+    assert other.overlap < LEAST_OVERLAP  # which is asked for of bones that a CT cuts
+    assert cut_faces(cut.mask) == [(2, True)]
+    assert cut_faces(outline(2.0).mask) == []
 
 
 def detection(seen: Tensor, points: Tensor) -> Detection:
