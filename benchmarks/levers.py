@@ -28,13 +28,13 @@ from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import Camera, Poses, about_point, exp_se3, transform_points
 from femoreg_torch.optimize import levenberg
 from femoreg_torch.registration import Scene, Stage, load_plan, prepare_scene
+from femoreg_torch.registration.compared import prepared
 from femoreg_torch.registration.imaging import tissue_integrals
 from femoreg_torch.registration.level import Level, binning
 from femoreg_torch.registration.objective import ImageCosts, image_costs
 from femoreg_torch.registration.scene import Body
 from femoreg_torch.registration.stage import run_stage
 from femoreg_torch.registration.step import chosen_kinds, chosen_objects
-from femoreg_torch.registration.weights import prepared
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.similarity.curvature import patch_curvature
 from femoreg_torch.similarity.kernels import image_gradients
