@@ -1,6 +1,5 @@
 """Levenberg–Marquardt: steps of second order, damped until they improve; from one start or from the best of many."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,6 +13,7 @@ _DAMPING = 1e-3  # at the start, relative to the curvature of each degree of fre
 _SOFTEST = 1e-4  # least curvature that counts, relative to the mean
 _LEAST_DAMPING = 1e-7
 _MOST_DAMPING = 1e4
+_LONGEST = 30.0  # units of the scales: where nothing bends the values, a step would lead out of all reach
 _SHORTER = 0.5  # times the length of a step that fits worse: the most of the next one
 _SOFT = 5  # directions that are looked along for the bottom of a valley
 _FLAT = 1e-9  # second difference of values that is none
@@ -98,7 +98,7 @@ def _descend(
 ) -> _End | None:
     """Where a descent from one start leads; None if that is where an earlier one ended."""
     here, model = start, _quadratic(track, objective, start)
-    damping, growth, longest = _DAMPING, 2.0, math.inf
+    damping, growth, longest = _DAMPING, 2.0, _LONGEST
     for _ in range(settings.max_iterations):
         if any(model.value >= end.value and float((here - end.delta).norm()) < _SAME for end in earlier):
             return None
@@ -118,7 +118,7 @@ def _descend(
         if ratio > 0:
             here, model = here + step, trial
             damping = max(_LEAST_DAMPING, damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3))
-            growth, longest = 2.0, math.inf
+            growth, longest = 2.0, _LONGEST
         else:
             longest = _SHORTER * float(step.norm())
     return _End(Stop.BUDGET, model.value, here, model.hessian)

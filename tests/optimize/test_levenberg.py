@@ -1,5 +1,7 @@
 """Levenberg–Marquardt on sums of squares of known minimum."""
 
+from itertools import pairwise
+
 import pytest
 import torch
 from torch import Tensor
@@ -125,6 +127,22 @@ def test_after_a_step_that_fits_worse_the_next_is_at_most_half_as_long() -> None
             rejected += len(lengths) > 2
             assert lengths[-1] <= lengths[-2] / 2 * (1 + 1e-9)
     assert rejected, "no step was rejected twice, so nothing was asked"
+
+
+def test_no_step_leads_out_of_reach_where_next_to_nothing_bends_the_values() -> None:
+    asked: list[Tensor] = []
+
+    def leaning(delta: Tensor) -> Quadratic:
+        """Stiff along the first, a slope and hardly a bend along the second."""
+        asked.append(delta)
+        scores = torch.stack([delta[0], torch.tensor(1.0, dtype=torch.float64)])
+        return Quadratic(float(0.5 * delta[0] ** 2 + delta[1]), scores[None], torch.diag(scores.new_tensor([1.0, 0.0])))
+
+    objective = SmoothObjective(lambda deltas: 0.5 * deltas[:, 0].square() + deltas[:, 1], leaning)
+    LevenbergMarquardt(max_iterations=3).minimise(objective, 2, seed=0)
+    steps = [float((after - before).norm()) for before, after in pairwise(asked)]
+    assert max(steps) <= 30
+    assert max(steps) > 1
 
 
 def test_where_nothing_holds_a_direction_no_parabola_is_followed() -> None:

@@ -11,11 +11,13 @@ from pathlib import Path
 
 import httpx
 import pytest
+import torch
 from starlette.testclient import TestClient
 
-from femoreg_torch.case import Case, read_result, result_content, write_json
+from femoreg_torch.case import Case, read_case, read_result, result_content, write_json
 from femoreg_torch.case.review import REVIEW_NAME, Review, read_review, result_sha256, write_review
 from femoreg_torch.commands.main import main
+from femoreg_torch.commands.register import register_into
 from femoreg_torch.commands.review import register_order
 from femoreg_torch.errors import InputError
 from femoreg_torch.registration import Scene
@@ -293,3 +295,14 @@ def test_a_run_is_not_shown_while_another_folder_is_written_to(
     assert main(["review", str(run), "--case", str(drawn_case), "--out", str(tmp_path / "new")]) == 2
     assert "--out: " in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_a_new_result_removes_the_scene_of_the_one_before(run: Path, order: Order, true_pose: torch.Tensor) -> None:
+    (run / "slicer").mkdir()
+    (run / "slicer" / "scene.mrml").write_text("<!-- Trusted -->", encoding="utf-8")
+    (run / "notes.txt").write_text("of a person", encoding="utf-8")
+    start = run.parent / "start.json"
+    write_json(start, {f"camera1_from_{name}": true_pose for name in ("pelvis", "femur")})
+    register_into(run, read_case(order.case), order.preset, 0, start=start)
+    assert not (run / "slicer").exists()
+    assert (run / "notes.txt").exists()
