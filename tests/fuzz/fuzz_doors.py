@@ -177,7 +177,8 @@ def _whole(folder: Path) -> Iterator[Door]:
     trimesh.creation.box((6.0, 4.0, 20.0)).export(folder / "device.stl")
     for name in ("a", "a_device", "b", "b_device"):
         cv2.imwrite(str(folder / f"{name}.tif"), draw.integers(500, 4000, (48, 64), dtype=np.uint16))
-    points = {name: [2.0 * n, 20.0, 30.0 - n] for n, name in enumerate(HIP.landmark_names)}
+    height = {"hip_left": 8.0, "hip_right": 18.0, "femur_left": 31.0, "femur_right": 31.0}
+    points = {mark.name: [8.0 + n, 20.0, height[mark.bone]] for n, mark in enumerate(HIP.landmarks)}
     _text(folder / "landmarks.json", {"space": "LPS", "unit": "mm", "landmarks": points})
     content = {
         "version": 2,
