@@ -40,6 +40,7 @@ class SilhouetteFit:
     camera_from_ct: Tensor  # (4, 4) float64
     overlap: float  # Dice in the band about the bone that is seen
     covariance: Tensor  # (6, 6) of (rotation in rad, translation in mm), camera axes, about the centre given
+    beyond: float = 0.0  # share of the bone that is seen which lies beyond a CT that cuts it, and so was not compared
 
     @property
     def rotation_deviation_deg(self) -> float:
@@ -80,9 +81,12 @@ def refine_by_silhouette(
     saturation) nothing is compared, nor where the segmentation sees bones that may hide those of the outline, nor, of
     a CT that cuts these, what lies beyond it.
     """
-    looked_at = _looked_at(seen, outline, anatomy, attenuation, camera, field)
-    looked_at = (looked_at & ~_beyond(outline.mask, camera_from_ct, seen.camera)).flatten().nonzero()[:, 0]
-    target = seen.probabilities[list(anatomy.classes(outline.bones))].sum(0).flatten()[looked_at].double()
+    there = _looked_at(seen, outline, anatomy, attenuation, camera, field)
+    beyond = _beyond(outline.mask, camera_from_ct, seen.camera)
+    looked_at = (there & ~beyond).flatten().nonzero()[:, 0]
+    probability = seen.probabilities[list(anatomy.classes(outline.bones))].sum(0)
+    left_out = float((probability > 0.5)[there & beyond].sum() / (probability > 0.5)[there].sum().clamp_min(1))
+    target = probability.flatten()[looked_at].double()
     root = torch.linalg.cholesky(covariance.double())  # twist = root · u, with u of unit variance
 
     def poses(units: Tensor) -> Tensor:
@@ -117,7 +121,7 @@ def refine_by_silhouette(
     bone = target > 0.5
     overlap = 2 * float((inside & bone).sum()) / max(float(inside.sum() + bone.sum()), 1.0)
     posterior = root @ torch.linalg.inv(quadratic(best).hessian) @ root.T
-    return SilhouetteFit(poses(best[None])[0], overlap, posterior)
+    return SilhouetteFit(poses(best[None])[0], overlap, posterior, left_out)
 
 
 def _looked_at(
@@ -142,7 +146,7 @@ def _looked_at(
     return near & ~hidden & ~dilated(covered, _HIDDEN_MARGIN_MM, seen.camera)
 
 
-def cut_faces(mask: Volume) -> list[tuple[int, bool]]:
+def _cut_faces(mask: Volume) -> list[tuple[int, bool]]:
     """The faces of a CT that cut the bones of its mask: axis (0 is x of the index), and whether it is the last one."""
     faces = [(axis, last) for axis in range(3) for last in (False, True)]
     return [(axis, last) for axis, last in faces if float(mask.data.select(2 - axis, -int(last)).max()) > _CUT]
@@ -153,7 +157,7 @@ def _beyond(mask: Volume, camera_from_ct: Tensor, camera: Camera) -> Tensor:
     spacing = torch.tensor(mask.spacing_mm, dtype=torch.float64)
     size = torch.tensor(mask.data.shape).flip(0) * spacing
     found = torch.zeros(camera.shape, dtype=torch.bool, device=mask.data.device)
-    for axis, last in cut_faces(mask):
+    for axis, last in _cut_faces(mask):
         extent, first = size.clone(), torch.zeros(3, dtype=torch.float64)  # mm along the axes, from the CT's corner
         extent[axis], first[axis] = _BEYOND_MM, size[axis] if last else -_BEYOND_MM
         counts = (extent / _BOX_MM).ceil()

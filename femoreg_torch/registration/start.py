@@ -16,7 +16,7 @@ from femoreg_torch.geometry import Camera, transform_points
 from femoreg_torch.pnp import FRONT_TO_BACK, MINIMUM, PnpResult, likely_pose, solve_pnp
 from femoreg_torch.registration.prepare import view_distortion
 from femoreg_torch.registration.scene import Outline, Scene, Segmentation
-from femoreg_torch.registration.silhouette import cut_faces, refine_by_silhouette
+from femoreg_torch.registration.silhouette import refine_by_silhouette
 
 Detector = Callable[[Tensor, Camera], Detection]  # finds the landmarks in an attenuation image (H, W) of a camera
 
@@ -25,6 +25,9 @@ Detector = Callable[[Tensor, Camera], Detection]  # finds the landmarks in an at
 # and 102, also where shutters leave less than half of the image; and where four or more agree: of 221 such starts in
 # images of two simulators all 4 from 0.83 to 0.90 were within 5°, and none was less. With few, one of 0.84 was 54° off.
 LEAST_OVERLAP, _LEAST_WITH_LANDMARKS = 0.90, 0.80
+# Share of the bones that lies beyond a CT that cuts them, from which as much is asked for as with few landmarks: what is
+# left of another patient's, narrower by 0.7, agreed by 83 %; of two right ones by 96 and 97 %.
+_MUCH_BEYOND = 0.1
 # Greatest standard deviation of the rotation, over all axes, of a start by landmarks alone, or by few of them and
 # outlines. Outlines mend what is more open (9° open: 2 to 3° off afterwards).
 MOST_ROTATION_DEG = 5.0
@@ -214,9 +217,9 @@ def find_start(
     (depth within 35 mm), one 5 mm across (its CT was scaled), and one was refused.
 
     Raises `InputError` if the grey values are inverted, which would mislead the similarity even where the landmarks are
-    found, if the bones drawn at the pose cover those that the network sees by less than 80 % (Dice), or 90 % where the
-    CT cuts them, or, without an outline, if fewer than four landmarks are of use or agree, or leave the rotation open
-    by more than 5°.
+    found, if the bones drawn at the pose cover those that the network sees by less than 80 % (Dice), or 90 % where more
+    than a tenth of these lies beyond a CT that cuts them, or, without an outline, if fewer than four landmarks are of
+    use or agree, or leave the rotation open by more than 5°.
     """
     if detection.inverted:
         raise InputError(
@@ -271,8 +274,7 @@ def find_start(
     )
     if too_few is not None and (fit.overlap < LEAST_OVERLAP or fit.rotation_deviation_deg > MOST_ROTATION_DEG):
         raise too_few
-    # Of bones that the CT cuts, less is compared: another patient's, narrower by 0.7, agreed by 83 %, its own by 96 %.
-    least = LEAST_OVERLAP if cut_faces(outline.mask) else _LEAST_WITH_LANDMARKS
+    least = LEAST_OVERLAP if fit.beyond > _MUCH_BEYOND else _LEAST_WITH_LANDMARKS
     if fit.overlap < least:
         raise InputError(
             f"{', '.join(outline.bones)} of the CT, drawn where the landmarks put them, and as the network sees them "
