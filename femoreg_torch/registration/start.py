@@ -25,7 +25,7 @@ Detector = Callable[[Tensor, Camera], Detection]  # finds the landmarks in an at
 # and 102, also where shutters leave less than half of the image; and where four or more agree: of 221 such starts in
 # images of two simulators all 4 from 0.83 to 0.90 were within 5°, and none was less. With few, one of 0.84 was 54° off.
 LEAST_OVERLAP, _LEAST_WITH_LANDMARKS = 0.90, 0.80
-# Share of the bones that lies beyond a CT that cuts them, from which as much is asked for as with few landmarks: what is
+# Share of the bones that lies beyond a CT that cuts them, from which as much is asked as with few landmarks: what is
 # left of another patient's, narrower by 0.7, agreed by 83 %; of two right ones by 96 and 97 %.
 _MUCH_BEYOND = 0.1
 # Greatest standard deviation of the rotation, over all axes, of a start by landmarks alone, or by few of them and
