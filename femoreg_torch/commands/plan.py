@@ -36,7 +36,7 @@ def plan(
     from femoreg_torch.planning.figures import curves_figure, overlay_figure, save
     from femoreg_torch.planning.plan import make_plan
     from femoreg_torch.planning.prepare import prepare
-    from femoreg_torch.planning.report import OF_A_PLAN, write_plan
+    from femoreg_torch.planning.report import ROBUSTNESS_NAMES, write_plan
     from femoreg_torch.planning.settings import load_planning
 
     console = Console()
@@ -47,7 +47,7 @@ def plan(
     prepared = prepare(content, load_planning(preset), device=place)
     with progress_report(console, "optimal cement") as report:
         found = make_plan(prepared, volume_ml, seed, report)
-    with new_folder(out, without=OF_A_PLAN) as folder:
+    with new_folder(out, without=ROBUSTNESS_NAMES) as folder:
         write_plan(folder, content, prepared, found, seed)
         curves = {"without cement": found.baseline, "as planned": found.curve, "optimum": found.optimum_curve}
         save(curves_figure(curves), folder / "curves.png")

@@ -26,7 +26,8 @@ from femoreg_torch.volume import read_label_map, write_volume
 Array = NDArray[np.float64]
 
 PLAN_NAME = "plan.json"
-OF_A_PLAN = ("offsets.json", "offsets.png", "robustness.json", "robustness.png")  # what is told of one afterwards
+# What is computed of a plan afterwards.
+ROBUSTNESS_NAMES = ("offsets.json", "offsets.png", "robustness.json", "robustness.png")
 CEMENT_NAME, OPTIMUM_NAME = "cement.nii.gz", "optimum.nii.gz"
 NOTICE = "Research software, not a medical device. Loads are those of a model that no test of bones has confirmed."
 
