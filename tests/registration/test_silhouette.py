@@ -155,6 +155,14 @@ def test_few_landmarks_and_outlines_tell_a_start(seen: Tensor, count: int) -> No
         find_start(landmarks, few, image, CAMERA, outline(2.0, 0.7), HIP)
     with pytest.raises(InputError, match=refused):
         find_start(landmarks, few, image, CAMERA, outline(2.0), HIP, None, (1.0, 0.0, 0.0))
+    shaved = outline(2.0, 0.85)
+    with pytest.raises(InputError, match=refused):
+        find_start(landmarks, few, image, CAMERA, shaved, HIP)
+    doubtful = find_start(landmarks, few, image, CAMERA, shaved, HIP, among_views=True)
+    assert doubtful.overlap is not None
+    assert doubtful.overlap < LEAST_OVERLAP  # which the other views are to make up for
+    with pytest.raises(InputError, match=refused):
+        find_start(landmarks, few, image, CAMERA, outline(2.0, 0.7), HIP, among_views=True)
     with pytest.raises(InputError, match="0 usable landmarks found"):
         find_start(landmarks, replace(few, visible=few.visible & False), image, CAMERA, outline(2.0), HIP)
 
