@@ -77,8 +77,8 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
     """Models of which a part was found to attenuate next to nothing, in words.
 
     What lies within other parts, as a drill in its sleeve, does not count: the images tell the two together, and how
-    the shadow is shared out among them is open. Nor does what no image shows, as the end of a handle: whatever is
-    estimated of it is chance.
+    the shadow is shared out among them is open. Nor does what no image shows, as the end of a handle, or
+    shows before what is saturated: whatever is estimated of it is chance.
     """
     found = []
     for name, thing in scene.objects.items():
@@ -91,7 +91,7 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
             empty &= ~_within_others(thing.volume.data >= _CASTS_NO_SHADOW, width)
             where = empty.nonzero()
             points = transform_points(thing.volume.lps_from_index, where.flip(1).double().cpu())
-            empty[where.unbind(1)] = in_view(scene, poses, name, points).to(empty.device)
+            empty[where.unbind(1)] = in_view(scene.where_unsaturated(), poses, name, points).to(empty.device)
             share = float(empty.sum() / inside.sum())
         if share > _MOST_WITHOUT_SHADOW:
             found.append(

@@ -114,7 +114,7 @@ def _scatter_ratio(scene: Scene, poses: Poses, seen: list["View"], fit: Doubles,
     """
     found = []
     for n, view in enumerate(seen):
-        dark = view.paths @ fit[:regions] > -math.log(_DARK)
+        dark = (view.paths @ fit[:regions] > -math.log(_DARK)) & ~view.white
         if dark.sum() < LEAST_PIXELS:
             continue
         camera = poses.camera(view.pair.view, LEVEL.camera(scene.carm.camera))

@@ -192,11 +192,12 @@ def doubts_about_the_views(scene: Scene, poses: Poses) -> tuple[str, ...]:
     """Views whose C-arm was found where no orbit leads, in words; none where its poses are given."""
     if scene.camera_from_camera1 is not None:
         return ()
-    orbit = orbits(scene, poses, _ORBIT_DEG, 1.0)
+    orbit = orbits(scene, poses, _ORBIT_DEG)
     isocentre = torch.tensor(scene.carm.isocentre_mm, dtype=torch.float64)
     told = []
     for view, found in enumerate(poses.camera_from_camera1[1:], 2):
-        deg, mm = min(pose_difference(pose, found, isocentre) for pose in orbit)
+        away = [pose_difference(pose, found, isocentre) for pose in orbit]
+        deg, mm = min(away, key=lambda each: max(each[0] / _MOST_OFF_ORBIT_DEG, each[1] / _MOST_OFF_ORBIT_MM))
         if not (deg <= _MOST_OFF_ORBIT_DEG and mm <= _MOST_OFF_ORBIT_MM):
             told.append(
                 f"the C-arm of view {view} lies {mm:.0f} mm and {deg:.0f}° off its orbit: check that the image is not "

@@ -16,6 +16,7 @@ from femoreg_torch.registration.scene import RigidObject
 from femoreg_torch.settings import check_within
 from femoreg_torch.volume import Volume
 
+_FAINT = 1.5  # line integral: of what is fainter, a saturated image shows next to nothing
 _AS_GUESSED = 2.5  # factor of the scattered light
 _TISSUE = Level(pixel_mm=3.1, step_mm=3.0)  # how finely the soft tissue is drawn; it is smooth
 
@@ -46,6 +47,23 @@ class Imaging:
 
 
 PLAIN = Imaging()
+
+
+def below_white(integrals: Tensor, white: Tensor | None) -> Tensor:
+    """What a saturated image shows of line integrals (..., H, W): L (1 − exp(−(L / 1.5)²)) where it is `white` (H, W).
+
+    What takes less light than the image has too much of leaves no shadow there. How much that is nobody tells. By this
+    form faint things are not drawn, and dense ones as they are, so that nothing is drawn along the border of the white.
+    """
+    if white is None:
+        return integrals
+    return torch.where(white, -integrals * torch.expm1(-((integrals / _FAINT) ** 2)), integrals)
+
+
+def below_white_slope(integrals: Tensor, white: Tensor) -> Tensor:
+    """The derivative of `below_white` by the integrals."""
+    squared = (integrals / _FAINT) ** 2
+    return torch.where(white, 2 * squared * (-squared).exp() - torch.expm1(-squared), 1)
 
 
 def filled(integrals: Tensor, scatter: Tensor | None) -> Tensor:

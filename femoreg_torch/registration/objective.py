@@ -15,6 +15,8 @@ from femoreg_torch.registration.compared import prepared, veil_over
 from femoreg_torch.registration.imaging import (
     PLAIN,
     Imaging,
+    below_white,
+    below_white_slope,
     draw,
     draw_with_jacobian,
     filled,
@@ -56,6 +58,7 @@ class _Target:
     moving: tuple[str, ...]
     tissue: Tensor | None  # (H, W): seen besides, or nothing
     scatter: Tensor | None  # per primary light, () or (H, W): fills shadows, or nothing
+    white: Tensor | None  # (H, W), bool: where the view's first image is saturated, or nothing
 
     def cost(self, drawn: Tensor) -> Tensor:
         """Costs (P,) of line integrals (P, H, W)."""
@@ -63,7 +66,7 @@ class _Target:
 
     def seen(self, drawn: Tensor) -> Tensor:
         """Images (..., H, W) of line integrals."""
-        image = filled(drawn, self.scatter)
+        image = filled(below_white(drawn, self.white), self.scatter)
         return image if self.tissue is None else image + self.tissue
 
 
@@ -104,7 +107,10 @@ def _target(
     tissue = None
     if imaging.tissue and scene.tissue is not None:
         tissue = imaging.tissue * tissue_integrals(scene.tissue, poses.camera_from(scene.anchor)[view], camera)
-    return _Target(view, camera, fixed, background, tuple(n for n in drawn if n in moves), tissue, scatter)
+    white = None
+    if scene.first_kind in scene.saturated and (mask := scene.saturated[scene.first_kind][view]) is not None:
+        white = ~level.field(~mask, scene.carm.camera)
+    return _Target(view, camera, fixed, background, tuple(n for n in drawn if n in moves), tissue, scatter, white)
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,7 +326,9 @@ class ImageCosts:
                 jacobians.append(change * hardened_slope(seen[target.view, name][0], self.objects[name].hardening))
         changes = torch.cat(jacobians)
         if target.scatter is not None:
-            changes *= filled_slope(drawn, target.scatter)
+            changes *= filled_slope(below_white(drawn, target.white), target.scatter)
+        if target.white is not None:
+            changes *= below_white_slope(drawn, target.white)
         return target.similarity, target.seen(drawn), changes.movedim(0, -1)
 
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from torch import Tensor
@@ -50,6 +51,7 @@ _TOLD_WITHIN = 0.3  # deviation of the logarithm of what a named material attenu
 _TOLD_WEIGHT = 1 / 200  # of one named material beside all pixels, whose misfits are alike over wide regions
 _HARDENING_WEIGHT = 1 / 50  # of the common tube beside them; with 1/200 named devices were placed less well
 _MISFIT = 0.05  # of a logarithm of intensity; larger ones (something else has changed) count less
+_BEYOND_WHITE = 1.0  # of a logarithm of intensity: light that a saturated image may have too much of
 _LEAST_PASSING = 1e-3  # of 1 + h Σ a ℓ, where a motion of the device takes its path below nothing
 _CORNERS = 4  # of the box around the device: scattered light is interpolated between them
 _AT_HARDENING, TURN = -7, slice(-6, None)  # where hardening and twist stand among the parameters, see `solve`
@@ -95,7 +97,8 @@ class Pair:
     view: int
     without: Doubles  # (H · W,) intensities
     with_it: Doubles
-    told: Tensor  # (H, W), bool: what both tell, as no shutter shades it and nothing is saturated
+    told: Tensor  # (H, W), bool: no shutter shades it, and it is not saturated, or without the device as well
+    white: Tensor  # (H, W), bool: saturated without the device
 
 
 def pairs_of(scene: Scene, kind: Kind) -> list[Pair]:
@@ -105,14 +108,20 @@ def pairs_of(scene: Scene, kind: Kind) -> list[Pair]:
         image = LEVEL.image(scene.image(k, view), scene.carm.camera)
         return (-image.cpu()).exp().flatten().double().numpy()
 
-    def told(k: Kind, view: int) -> Tensor:
-        stored, field = scene.image(k, view), scene.field(k, view)
-        dark = stored > (stored if field is None else stored[field]).amin()  # a saturated pixel hides shadows
-        return LEVEL.field(dark if field is None else dark & field, scene.carm.camera).cpu()
+    def exposed(k: Kind, view: int) -> Tensor:
+        field = scene.field(k, view)
+        return torch.ones_like(scene.image(k, view), dtype=torch.bool) if field is None else field
+
+    def unsaturated(k: Kind, view: int) -> Tensor:
+        image = scene.image(k, view)
+        return image > image[exposed(k, view)].amin()
 
     def pair(view: int) -> Pair:
-        first = scene.first_kind
-        return Pair(view, intensity(first, view), intensity(kind, view), told(first, view) & told(kind, view))
+        first, camera = scene.first_kind, scene.carm.camera
+        both = exposed(first, view) & exposed(kind, view)
+        dark, hides = unsaturated(first, view), unsaturated(first, view) & ~unsaturated(kind, view)
+        told, white = LEVEL.field(both & ~hides, camera).cpu(), ~LEVEL.field(dark, camera).cpu()
+        return Pair(view, intensity(first, view), intensity(kind, view), told, white)
 
     return on_all_cores(pair, [view for _, view in scene.there([kind], range(scene.views))], scene.device)
 
@@ -127,6 +136,7 @@ class View:
     changes: Doubles  # (N, 6) of the path · attenuation by a twist, in units of `TWIST`
     without: Doubles  # (N,) intensities
     with_it: Doubles
+    white: NDArray[np.bool_]  # (N,): saturated without the device
     corners: Doubles  # (N, 4): share of each corner of the box around the device
 
 
@@ -155,8 +165,8 @@ def views_of(
             changes = (jacobian[0].flatten(0, 1)[chosen].double() @ turn).numpy() * TWIST
         elif len(chosen) < LEAST_PIXELS:
             return None
-        without, with_it = pair.without[chosen], pair.with_it[chosen]
-        return View(pair, chosen, paths[chosen], changes, without, with_it, _corners(chosen, camera))
+        without, with_it, white = pair.without[chosen], pair.with_it[chosen], pair.white.flatten().numpy()[chosen]
+        return View(pair, chosen, paths[chosen], changes, without, with_it, white, _corners(chosen, camera))
 
     return [view for view in on_all_cores(look, pairs) if view is not None]
 
@@ -250,7 +260,11 @@ def _corners(pixels: Indices, camera: Camera) -> Doubles:
 
 
 def residuals(x: Doubles, seen: list[View], n: int, regions: int) -> tuple[Doubles, Doubles, Doubles, Doubles]:
-    """Differences of the logarithms of intensity (N,) of view n, and their derivatives by Σ a ℓ, by S and by h."""
+    """Differences of the logarithms of intensity (N,) of view n, and their derivatives by Σ a ℓ, by S and by h.
+
+    Where the image without the device is saturated, up to 2.7 times as much light as it shows may have been there: what
+    that explains is no difference.
+    """
     view = seen[n]
     gain = x[regions + _CORNERS * len(seen) + n]
     scatter = view.corners @ x[scatter_of(n, regions)]
@@ -262,4 +276,6 @@ def residuals(x: Doubles, seen: list[View], n: int, regions: int) -> tuple[Doubl
     total = primary * light + scatter
     by_path = primary * light / passing / total
     by_hardening = -primary * light * (np.log(passing) / h - integrals / passing) / (h * total)
-    return np.log(view.with_it) - gain - np.log(total), by_path, -(1 - light) / total, by_hardening
+    residual = np.log(view.with_it) - gain - np.log(total)
+    residual -= np.where(view.white, residual.clip(0, _BEYOND_WHITE), 0)
+    return residual, by_path, -(1 - light) / total, by_hardening

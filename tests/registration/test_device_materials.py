@@ -188,6 +188,32 @@ def test_saturated_pixels_tell_nothing_of_a_part_before_them() -> None:
     assert of_rod > 5 * of_handle
 
 
+def test_more_light_than_a_saturated_image_tells_explains_what_a_device_lets_through(mixed: Scene) -> None:
+    """Up to 2.7 times as much; a device that is brighter than it can be is a difference as elsewhere."""
+    share = mixed.objects["device"].volume
+    share = share.with_data(share.data / share.data.max())
+    device = device_of("device", "device", share, torch.where(share.data > 0, 0, -1), 1)
+    (seen, *_) = views_of(mixed, poses(), device, pairs_of(mixed, "device"))
+    assert not seen.white.any()
+    for attenuation in (0.02, 0.3):
+        x = first_guess([seen], np.array([attenuation]))
+        plain, before_white = (
+            residuals(x, [replace(seen, white=np.full_like(seen.white, white))], 0, 1)[0] for white in (False, True)
+        )
+        assert plain.min() < -0.1 or plain.max() > 1.1
+        np.testing.assert_allclose(before_white, plain.clip(None, 0) + (plain - 1).clip(0, None), atol=1e-12)
+
+
+def test_a_dense_model_of_a_light_part_before_saturated_light_is_told_from_metal() -> None:
+    """No unsaturated pixel shows the handle: that it is no metal is told by how bright it leaves the image."""
+    scene = make_scene(METAL, LIGHT, tissue_from=12.0, brightest=0.25)
+    fit = fit_device(scene, poses(), "device", "device")
+    assert fit is not None
+    handle = (HANDLE.data > 0) & (ROD.data == 0)
+    of_rod, of_handle = fit.volume.data[ROD.data > 0].median(), fit.volume.data[handle].median()
+    assert 3 * of_handle < of_rod
+
+
 def test_named_parts_keep_their_bounds(mixed: Scene) -> None:
     """Each named part is one material, whatever is told of it; here both are told wrong."""
     parts = (ROD.with_data(ROD.data * 0.3), HANDLE.with_data((HANDLE.data - ROD.data).clamp_min(0) * 0.1))

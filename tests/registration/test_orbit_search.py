@@ -3,13 +3,15 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from registration_scenes import CARM, REFERENCE_POINTS, error, float64, make_scene, true_poses
+from scipy.spatial.transform import Rotation
 
-from femoreg_torch.geometry import Poses, about_point, exp_se3, transform_points
+from femoreg_torch.geometry import Poses, about_point, exp_se3, exp_so3, rigid, transform_points
 from femoreg_torch.registration import Level, OrbitSearch
-from femoreg_torch.registration.orbit import search_orbit
+from femoreg_torch.registration.orbit import search_orbit, tilted
 from femoreg_torch.similarity import GradNcc
 
 SEARCH = OrbitSearch("orbit", ["anatomy"], ["pelvis", "femur"], 40, 1, Level(3.0, 2.0), GradNcc(patch_radius=3))
@@ -67,7 +69,48 @@ def test_a_view_from_far_off_is_found(angle_deg: float, centred: bool) -> None:
     mm, deg = error(found.poses.camera_from("pelvis")[1], truth.camera_from("pelvis")[1], REFERENCE_POINTS["pelvis"])
     assert mm < 25  # along the beam
     assert deg < 3
-    assert found.evaluations == 81 + 12 + 2 * 201 + 12
+    assert found.evaluations == 81 + 12 + 51 * (2 + 2 * 9) + 12 + 105 + 12
+
+
+@pytest.mark.parametrize(("turn_deg", "tilt_deg", "tilted_first"), [(25, 18, False), (-30, -15, True), (6, 24, False)])
+def test_a_tilted_view_is_found(turn_deg: float, tilt_deg: float, tilted_first: bool) -> None:
+    """Towards head or feet, by C-arms that tilt what turns or turn what tilts, from a view 1 that is tilted itself."""
+    poses = true_poses()
+    turn, tilt = float64(0, math.radians(turn_deg), 0), float64(math.radians(tilt_deg), 0, 0)
+    upright = exp_so3(float64(math.radians(-10), 0, 0))  # of the patient's own axes, 10° off those of view 1
+    order = [exp_so3(turn), exp_so3(tilt)] if tilted_first else [exp_so3(tilt), exp_so3(turn)]
+    pelvis = transform_points(poses.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"][None])[0]
+    moved_by = about_point(rigid(upright.mT @ order[0] @ order[1] @ upright), pelvis)
+    truth = poses.with_view(1, moved_by)
+    scene = make_scene(truth, with_device=False)
+    search = replace(SEARCH, shift_mm=30.0, further_deg=100.0, further_above=0.5)
+    known = truth.with_view(1, torch.eye(4, dtype=torch.float64))
+    along = search_orbit(scene, known, replace(search, further_deg=0.0), 1)
+    found = search_orbit(scene, known, search, 1)
+    offs = [
+        error(record.poses.camera_from("pelvis")[1], truth.camera_from("pelvis")[1], REFERENCE_POINTS["pelvis"])[1]
+        for record in (along, found)
+    ]
+    assert offs[0] > 10
+    assert offs[1] < 5
+
+
+def test_tilted_c_arms_turn_and_tilt_by_the_patients_axes() -> None:
+    """Against rotations by SciPy, from a view 1 that is turned, tilted and rolled itself."""
+    upright = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    about = Rotation.from_euler
+    for first in ("zxy", "zyx"):  # uppercase would turn the other way round: what stands last turns first
+        view_1 = about(first.upper(), [8.0, -12.0, 20.0], degrees=True).as_matrix() @ upright
+        pose = rigid(torch.from_numpy(view_1), float64(10, 20, 600))
+        middle = transform_points(pose, float64(0, 0, 0)[None])[0]
+        moved = tilted(pose, middle, float64(math.radians(-30.0)))
+        after = (moved @ pose)[:, :3, :3].numpy()
+        turned = [20.0 - 30.0, -12.0 + 16.0] if first == "zxy" else [-12.0 - 30.0, 20.0 + 16.0]
+        angles = [8.0, *(turned[::-1] if first == "zxy" else turned)]
+        expected = about(first.upper(), angles, degrees=True).as_matrix() @ upright
+        assert np.abs(after - expected).max((1, 2)).min() < 1e-9
+        places = transform_points(moved, middle[None])
+        torch.testing.assert_close(places, middle.expand_as(places))
 
 
 def test_a_view_that_fits_is_looked_for_no_further() -> None:

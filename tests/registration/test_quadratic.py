@@ -10,7 +10,16 @@ import torch
 from registration_scenes import REFERENCE_POINTS, VOLUMES, float64, make_scene, off, segmentations, true_poses
 
 from femoreg_torch.registration import imaging as drawing
-from femoreg_torch.registration.imaging import PLAIN, Imaging, filled, filled_slope, hardened, hardened_slope
+from femoreg_torch.registration.imaging import (
+    PLAIN,
+    Imaging,
+    below_white,
+    below_white_slope,
+    filled,
+    filled_slope,
+    hardened,
+    hardened_slope,
+)
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import Prior, image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, reference_point_in_view
@@ -27,12 +36,13 @@ def _joint_objective(  # type: ignore[no-untyped-def]
     weights: tuple[Weighting, ...] = (),
     imaging: Imaging = PLAIN,
     similarity: Similarity = _SIMILARITY,
+    white: torch.Tensor | None = None,
 ):
-    """Every object and every C-arm but the first free, a little off the truth."""
+    """Every object and every C-arm but the first free, a little off the truth; saturated where it is `white` (H, W)."""
     poses = true_poses()
     scene = replace(make_scene(poses), segmentations=segmentations(poses), tissue=VOLUMES["femur"], scatter=0.1)
     metal = replace(scene.objects["device"], hardening=0.3)
-    scene = replace(scene, objects=scene.objects | {"device": metal})
+    scene = replace(scene, objects=scene.objects | {"device": metal}, saturated={"anatomy": (white,) * 3})
     for name, point in REFERENCE_POINTS.items():
         poses = poses.with_object(name, off(poses.camera1_from[name], point, (0.5, -0.4, 0.6), (0.5, 0.4, -2)))
     objects = tuple(
@@ -68,6 +78,31 @@ def test_the_gradient_is_the_slope_of_the_values_and_the_curvature_is_never_nega
     assert abs(model.value - float(joint(delta[None])[0])) < 1e-7
     assert (model.gradient - slope).norm() < 0.03 * slope.norm()
     assert torch.linalg.eigvalsh(model.hessian).min() > 0
+
+
+def test_the_gradient_is_the_slope_of_the_values_before_saturated_light_too() -> None:
+    white = torch.zeros(88, 88, dtype=torch.bool)
+    white[:, 30:] = True
+    joint = _joint_objective(imaging=Imaging(scatter=0.4), white=white)
+    delta = 0.3 * torch.randn(30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    model, h = joint.quadratic(delta), 0.04
+    values = joint(delta + h * torch.cat([torch.eye(30), -torch.eye(30)]).double())
+    slope = (values[:30] - values[30:]) / (2 * h)
+    assert abs(model.value - float(joint(delta[None])[0])) < 1e-7
+    assert (model.gradient - slope).norm() < 0.03 * slope.norm()
+    assert model.value != pytest.approx(_joint_objective(imaging=Imaging(scatter=0.4)).quadratic(delta).value, abs=1e-3)
+
+
+def test_before_saturated_light_faint_things_are_not_drawn_and_dense_ones_are() -> None:
+    white = torch.tensor([True, True, True, False])
+    integrals = torch.tensor([0.3, 0.8, 4.0, 0.3], dtype=torch.float64, requires_grad=True)
+    seen = below_white(integrals, white)
+    assert seen[0] < 0.02
+    assert seen[1] < 0.25
+    assert seen[2:].tolist() == pytest.approx([4.0, 0.3], abs=0.01)
+    (slope,) = torch.autograd.grad(seen.sum(), integrals)
+    torch.testing.assert_close(below_white_slope(integrals.detach(), white), slope)
+    assert below_white(integrals, None) is integrals
 
 
 def test_at_the_solution_the_curvature_is_that_of_the_values() -> None:
