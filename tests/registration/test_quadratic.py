@@ -82,15 +82,15 @@ def test_the_gradient_is_the_slope_of_the_values_and_the_curvature_is_never_nega
 
 def test_the_gradient_is_the_slope_of_the_values_before_saturated_light_too() -> None:
     white = torch.zeros(88, 88, dtype=torch.bool)
-    white[:, 30:] = True
-    joint = _joint_objective(imaging=Imaging(scatter=0.4), white=white)
+    white[:, 55:] = True
+    joint = _joint_objective(white=white)
     delta = 0.3 * torch.randn(30, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     model, h = joint.quadratic(delta), 0.04
     values = joint(delta + h * torch.cat([torch.eye(30), -torch.eye(30)]).double())
     slope = (values[:30] - values[30:]) / (2 * h)
     assert abs(model.value - float(joint(delta[None])[0])) < 1e-7
-    assert (model.gradient - slope).norm() < 0.03 * slope.norm()
-    assert model.value != pytest.approx(_joint_objective(imaging=Imaging(scatter=0.4)).quadratic(delta).value, abs=1e-3)
+    assert (model.gradient - slope).norm() < 0.06 * slope.norm()  # patches before the white hold little
+    assert model.value != pytest.approx(_joint_objective().quadratic(delta).value, abs=1e-3)
 
 
 def test_before_saturated_light_faint_things_are_not_drawn_and_dense_ones_are() -> None:

@@ -38,7 +38,7 @@ def cut_off(scene: Scene, bright: Tensor = BRIGHT, cut: float = 1.0, exposure: f
 
 
 def test_a_device_whose_end_lies_before_saturated_light_is_not_taken_for_bent() -> None:
-    scene = cut_off(make_scene(TRUTH))
+    scene = cut_off(make_scene(TRUTH), cut=3.0)
     (told,) = doubts_about_rigidity(scene, TRUTH, PLAIN)
     assert "the ends of the device" in told
     assert doubts_about_rigidity(scene.where_unsaturated(), TRUTH, PLAIN) == ()
