@@ -36,6 +36,7 @@ _FURTHER_SHIFT = 2.0  # times `shift_mm`, away from the range of the orbit
 # looked for about what was found. In twelve views of six cases of two simulators the search along the orbit came within
 # 2 to 31° (views were tilted towards head or feet by up to 20°), and this one within 1.0 to 3.7°.
 _TURN_STEP_DEG, _TILT_STEP_DEG, _MOST_TILT_DEG = 4.0, 8.0, 32.0
+_MOST_TURN_OF_TILTED_DEG = 60.0
 _COARSER_PIXEL, _COARSER_STEP = 1.25, 1.5  # times those of the level
 _ABOUT_DEG = (-6.0, 6.0, 7), (-3.0, 3.0, 5), (-4.0, 4.0, 3)  # about x, y and z of the camera: from, to, how many
 _ABOUT_SHIFT = 0.5  # times `shift_mm`
@@ -150,7 +151,8 @@ def orbits(scene: Scene, poses: Poses, half_range_deg: float) -> Tensor:
     angles, middle = orbit_angles(half_range_deg, _TURN_STEP_DEG), _middle(scene, poses)
     about_middle = replace(scene.carm, isocentre_mm=(0.0, 0.0, float(middle[2])))
     orbits_of_the_file = torch.cat([scene.carm.orbit(angles), about_middle.orbit(angles)])
-    return torch.cat([orbits_of_the_file, tilted(poses.camera1_from[scene.anchor], middle, angles)])
+    fewer = orbit_angles(min(half_range_deg, _MOST_TURN_OF_TILTED_DEG), _TURN_STEP_DEG)
+    return torch.cat([orbits_of_the_file, tilted(poses.camera1_from[scene.anchor], middle, fewer)])
 
 
 def _middle(scene: Scene, poses: Poses) -> Tensor:
@@ -171,13 +173,15 @@ def tilted(camera1_from_patient: Tensor, middle: Tensor, angles: Tensor) -> Tens
     turns the image in its plane in view 1 stays.
     """
     turn, tilt = torch.cartesian_prod(angles, torch.deg2rad(_tilts_deg())).unbind(1)
+    other = tilt != 0  # what is not tilted turns alike in both orders
     view_1 = camera1_from_patient[:3, :3] @ camera1_from_patient.new_tensor(_UPRIGHT).mT  # from upright camera axes
     left, up, along = view_1[2].tolist()  # its beam
     turned_first = _about("z", math.atan2(-float(view_1[0, 1]), float(view_1[1, 1]))) @ (
         _about("x", math.asin(max(-1.0, min(1.0, up))) + tilt) @ _about("y", math.atan2(-left, along) + turn)
     )
     tilted_first = _about("z", math.atan2(float(view_1[1, 0]), float(view_1[0, 0]))) @ (
-        _about("y", math.asin(max(-1.0, min(1.0, -left))) + turn) @ _about("x", math.atan2(up, along) + tilt)
+        _about("y", math.asin(max(-1.0, min(1.0, -left))) + turn[other])
+        @ _about("x", math.atan2(up, along) + tilt[other])
     )
     return about_point(rigid(torch.cat([turned_first, tilted_first]) @ view_1.mT), middle)
 
