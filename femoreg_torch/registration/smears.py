@@ -107,16 +107,16 @@ def _slopes_beside(image: np.ndarray, camera: Camera, where: np.ndarray) -> np.n
     """The same, less those around, and beside how strong edges are around."""
 
     def around(values: np.ndarray, sigma_mm: float) -> np.ndarray:
-        """Means (N,) of what is at the pixels `where` over those of them that lie around."""
-        laid_out, sigma = np.zeros((2, *where.shape)), [sigma_mm / mm for mm in camera.pixel_mm]
-        laid_out[:, where] = np.stack([values, np.ones_like(values)])
-        total, known = (ndimage.gaussian_filter(each, sigma)[where] for each in laid_out)
-        mean: np.ndarray = total / known
-        return mean
+        """Means (n, N) of values (n, N) at the pixels `where` over those of them that lie around."""
+        laid_out = np.zeros((len(values) + 1, *where.shape), np.float32)
+        laid_out[:-1, where], laid_out[-1, where] = values, 1
+        sigma = [sigma_mm / mm for mm in camera.pixel_mm]
+        *totals, known = (ndimage.gaussian_filter(each, sigma, truncate=2.0)[where] for each in laid_out)
+        return np.stack(totals) / known
 
     slopes = _slopes(image, camera, where)
-    slopes -= np.stack([around(slope, _SHADE_MM) for slope in slopes])
-    strength = around((slopes**2).sum(0), _ALIKE_MM)
+    slopes -= around(slopes, _SHADE_MM)
+    (strength,) = around((slopes**2).sum(0, keepdims=True), _ALIKE_MM)
     beside: np.ndarray = slopes / np.sqrt(strength + _FLOOR * strength.mean()).clip(np.finfo(float).tiny)
     return beside
 
