@@ -14,7 +14,7 @@ from femoreg_torch.case import Case
 from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.fluoro import Display
-from femoreg_torch.geometry import Poses, pose_difference, transform_points
+from femoreg_torch.geometry import Poses, rotation_angle, transform_points
 from femoreg_torch.registration.covariance import PoseCovariance
 from femoreg_torch.registration.device_doubts import (
     doubts_about_size,
@@ -200,8 +200,10 @@ def doubts_about_the_views(scene: Scene, poses: Poses) -> tuple[str, ...]:
     isocentre = torch.tensor(scene.carm.isocentre_mm, dtype=torch.float64)
     told = []
     for view, found in enumerate(poses.camera_from_camera1[1:], 2):
-        away = [pose_difference(pose, found, isocentre) for pose in orbit]
-        deg, mm = min(away, key=lambda each: max(each[0] / _MOST_OFF_ORBIT_DEG, each[1] / _MOST_OFF_ORBIT_MM))
+        turned = torch.rad2deg(rotation_angle(orbit[:, :3, :3].mT @ found[:3, :3]))
+        apart = (transform_points(orbit, isocentre[None]) - transform_points(found, isocentre[None])).norm(dim=-1)[:, 0]
+        nearest = torch.maximum(turned / _MOST_OFF_ORBIT_DEG, apart / _MOST_OFF_ORBIT_MM).argmin()
+        deg, mm = float(turned[nearest]), float(apart[nearest])
         if not (deg <= _MOST_OFF_ORBIT_DEG and mm <= _MOST_OFF_ORBIT_MM):
             told.append(
                 f"the C-arm of view {view} lies {mm:.0f} mm and {deg:.0f}° off its orbit: check that the image is not "
