@@ -55,7 +55,8 @@ class OrbitSearch:
 
     A view whose best cost is above `further_above` is looked for further, up to `further_deg` along the orbit, and with
     the C-arm turned so far about the patient's long axis and tilted towards head or feet, while what stands in the
-    middle of view 1 stays there: many users centre the hip again.
+    middle of view 1 stays there: many users centre the hip again. That takes steps of its own, of 4° and 8°, and not
+    `step_deg`.
     """
 
     name: str
@@ -170,7 +171,7 @@ def tilted(camera1_from_patient: Tensor, middle: Tensor, angles: Tensor) -> Tens
 
     Both about `middle` (3,) of camera 1, which stays where it is. The patient's axes, LPS, are told by the pose (4, 4):
     view 1 may be tilted itself. Some C-arms tilt what turns, others turn what tilts, so both orders are there. What
-    turns the image in its plane in view 1 stays.
+    turns the image in its plane in view 1 stays. Of a thing that is no patient, the axes of its own space are taken.
     """
     turn, tilt = torch.cartesian_prod(angles, torch.deg2rad(_tilts_deg())).unbind(1)
     other = tilt != 0  # what is not tilted turns alike in both orders

@@ -119,8 +119,9 @@ def pairs_of(scene: Scene, kind: Kind) -> list[Pair]:
     def pair(view: int) -> Pair:
         first, camera = scene.first_kind, scene.carm.camera
         both = exposed(first, view) & exposed(kind, view)
-        dark, hides = unsaturated(first, view), unsaturated(first, view) & ~unsaturated(kind, view)
-        told, white = LEVEL.field(both & ~hides, camera).cpu(), ~LEVEL.field(dark, camera).cpu()
+        dark = unsaturated(first, view)
+        hidden = dark & ~unsaturated(kind, view)
+        told, white = LEVEL.field(both & ~hidden, camera).cpu(), ~LEVEL.field(dark, camera).cpu()
         return Pair(view, intensity(first, view), intensity(kind, view), told, white)
 
     return on_all_cores(pair, [view for _, view in scene.there([kind], range(scene.views))], scene.device)
