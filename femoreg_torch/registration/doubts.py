@@ -5,6 +5,7 @@ The C-arm's file, its poses, the plan, images that show something else, and what
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import chain
 
 import torch
@@ -23,7 +24,7 @@ from femoreg_torch.registration.device_doubts import (
     doubts_about_units,
     doubts_beside_devices,
 )
-from femoreg_torch.registration.handedness import handedness
+from femoreg_torch.registration.handedness import Handedness, handedness
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.misfits import misfits
 from femoreg_torch.registration.motion import MotionBetween
@@ -110,7 +111,7 @@ def doubts(
     found = (
         *chain(*first),  # what moved or was smeared seems to be of another size as well
         *doubts_about_size(case, told, clear, poses, imaging),
-        *doubts_about_handedness(scene, poses, imaging),
+        *doubts_about_handedness(told, scene, poses, imaging),
         *doubts_about_rigidity(clear, poses, imaging),
     )
     found = (*doubts_about_units(case, told, bool(found)), *found)
@@ -301,10 +302,18 @@ def doubts_about_the_guide(case: Case, poses: Poses) -> tuple[str, ...]:
     )
 
 
-def doubts_about_handedness(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
-    """Objects whose mirror images fit better, in words. A round model is its own mirror image, but for a turn."""
+def doubts_about_handedness(told: Scene, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
+    """Objects whose mirror images fit better, in words. A round model is its own mirror image, but for a turn.
+
+    Asked of the objects as they were `told`: where a model is mirrored, what is estimated of its materials leaves out
+    what the images do not show, and the rest may be its own mirror image.
+    """
     names = [name for name in poses.camera1_from if scene.objects[name].axis is None]
-    every = on_all_cores(lambda name: handedness(scene, poses, name, imaging), names, scene.device)
+
+    def ask(name: str) -> Handedness:
+        return handedness(replace(scene, objects=scene.objects | {name: told.objects[name]}), poses, name, imaging)
+
+    every = on_all_cores(ask, names, scene.device)
     return tuple(
         f"the {name} fits the images better mirrored (similarity {fits.mirrored:.3f} against "
         f"{fits.similarity:.3f}): check the axes of the CT or model, and whether the images are mirrored"

@@ -36,6 +36,9 @@ class Handedness:
 def handedness(scene: Scene, poses: Poses, name: str, imaging: Imaging) -> Handedness:
     """Compare an object at its pose with its mirror image, fitted to the images from there.
 
+    Where the mirror image fits better than the object as it lies, the object is fitted likewise, so that the two are
+    compared alike.
+
     An object is mirrored at the plane that changes it least for the images, of the three planes through its centre of
     mass across its principal axes: for a pelvis that is the one between left and right.
     """
@@ -54,8 +57,10 @@ def handedness(scene: Scene, poses: Poses, name: str, imaging: Imaging) -> Hande
         for volume in mirror_images(_LEVEL.volume(thing.volume))
     ]
     nearest = min(mirrored, key=lambda candidate: float(candidate(candidate.still[None]).mean()))
-    fitted = _OPTIMISER.minimise(stage_objective(nearest, (body,), None), len(costs.still), seed=0)
-    return Handedness(1 - as_it_is, 1 - fitted.value)
+    turned_over = _OPTIMISER.minimise(stage_objective(nearest, (body,), None), len(costs.still), seed=0).value
+    if turned_over < as_it_is:
+        as_it_is = _OPTIMISER.minimise(stage_objective(costs, (body,), None), len(costs.still), seed=0).value
+    return Handedness(1 - as_it_is, 1 - turned_over)
 
 
 def mirror_images(volume: Volume) -> list[Volume]:
