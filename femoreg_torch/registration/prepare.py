@@ -155,10 +155,14 @@ def _named_points(thing: CaseObject) -> dict[str, Tensor]:
 
 
 def _read_model(case: Case, thing: CaseObject, model: Model) -> tuple[ModelVolumes, Axis | None]:
-    """An object's model as volumes, and its axis if it is round. Raises `InputError` for what does not fit."""
+    """An object's model as volumes, and its axis if it is round. Raises `InputError` for what does not fit.
+
+    Where its reference lies does not matter for that: of a round object deviations are told on the axis.
+    """
     volumes = model_attenuation(model)
     _check_points(case, thing, volumes.volume)
-    return volumes, round_axis(volumes.volume, volumes.parts, _named_points(thing).values())
+    elsewhere = [p for p in thing.points.values() if thing.reference is None or not torch.equal(p, thing.reference)]
+    return volumes, round_axis(volumes.volume, volumes.parts, elsewhere)
 
 
 def _check_points(case: Case, thing: CaseObject, volume: Volume) -> None:

@@ -1,13 +1,19 @@
 """Round objects: found, and not asked for the turn that no image tells."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
+import trimesh
+from registration_scenes import CARM
 from torch import Tensor
 
+from femoreg_torch.case import Case, CaseObject, Model, Start, View
+from femoreg_torch.fluoro import write_image
 from femoreg_torch.geometry import Poses, exp_so3
 from femoreg_torch.registration.covariance import IntrinsicsEstimate, PoseCovariance
+from femoreg_torch.registration.prepare import prepare_scene
 from femoreg_torch.registration.quality import _Judged
 from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.volume import Volume, axis_aligned
@@ -120,6 +126,24 @@ def test_a_point_off_the_axis_depends_on_the_turn() -> None:
     tip = MIDDLE + 60 * AXIS
     assert round_axis(rod, points=[tip]) is not None
     assert round_axis(rod, points=[tip, tip + 3 * side / side.norm()]) is None
+
+
+@pytest.mark.parametrize(("off", "round_"), [("center", True), ("tip", False)])
+def test_a_needle_is_round_wherever_its_errors_are_told(tmp_path: Path, off: str, round_: bool) -> None:
+    """Of a needle that lies obliquely in its own frame the middle of its box lies beside its axis."""
+    trimesh.creation.cylinder(2.0, 60.0).export(tmp_path / "needle.stl")
+    light = 20000 + 20000 * torch.rand((88, 88), generator=torch.Generator().manual_seed(0))
+    write_image(tmp_path / "view.tif", light.to(torch.uint16))
+    on_axis = {"tip": (0.0, 0.0, 30.0), "base": (0.0, 0.0, -30.0), "center": (0.0, 0.0, 0.0)}
+    points = {name: torch.tensor(at).double() for name, at in (on_axis | {off: (4.0, 0.0, 10.0)}).items()}
+    start = EYE.clone()
+    start[2, 3] = 640
+    model = Model(tmp_path / "needle.stl", 5000.0)
+    needle = CaseObject(
+        "needle", model=model, reference=points["center"], points=points, start=Start(camera1_from=start)
+    )
+    case = Case(tmp_path, CARM, {"needle": needle}, views=(View({"image": tmp_path / "view.tif"}),))
+    assert (prepare_scene(case).objects["needle"].axis is not None) is round_
 
 
 @pytest.mark.parametrize("where", ["beside", "both sides"])
