@@ -16,12 +16,14 @@ from femoreg_torch.evaluation.overlay import monitor_picture, paint_edges, small
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
 from femoreg_torch.intake.planes import Picture
-from femoreg_torch.registration import Scene, prepare_scene
+from femoreg_torch.registration import Scene, load_plan, prepare_scene
+from femoreg_torch.registration.another_view import start_from_a_view
 from femoreg_torch.registration.doubts import doubts_about_the_guide, doubts_about_the_plan
 from femoreg_torch.registration.run import network_detector
-from femoreg_torch.registration.start import look_at, start_by_detection, start_by_landmarks
+from femoreg_torch.registration.start import look_at, start_by_landmarks
 
 _WIDTH_PX = 560
+_PRESET = "fast"  # whose steps look for view 1 from another view, where it shows too little
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _LEAST_SHOWN = 0.25  # of a model: with less, a device may be seen by its round guide alone
 _YELLOW, _MAGENTA, _WHITE = (60, 230, 255), (255, 60, 255), (255, 255, 255)
@@ -46,9 +48,10 @@ def picture_of_start(case: Case, landmarks: Mapping[str, Tensor] | None = None) 
             record = start_by_landmarks(case, scene.anchor, landmarks)
         else:
             find = network_detector(case)
-            record = start_by_detection(case, scene, look_at(scene, 0, find), find)
+            record = start_from_a_view(case, scene, load_plan(_PRESET), look_at(scene, 0, find), find, seed=0)
         used = sum(mark.used for mark in record.landmarks.values())
-        facts.append(f"start: {record.source}, {used} landmarks within {record.reprojection_rms_px:.1f} pixels")
+        counted = f", {used} landmarks within {record.reprojection_rms_px:.1f} pixels" if record.landmarks else ""
+        facts.append(f"start: {record.source}{counted}")
     poses = scene.start(None if record is None else record.camera1_from_object)
     panels = [_panel(case, scene, poses, kind) for kind in scene.images if scene.images[kind][0] is not None]
     models = [name for name, thing in case.objects.items() if thing.model is not None]

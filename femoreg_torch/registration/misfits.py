@@ -75,6 +75,13 @@ def misfits(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[Misfit, ...]:
     return tuple(_explained(scene, poses, image, fits, imaging) for image in bad)
 
 
+def fits_like_view_1(scene: Scene, poses: Poses, view: int, imaging: Imaging) -> bool:
+    """Whether the first image of a view (from 0) fits what is drawn for it half as well as that of view 1 or better."""
+    images = [(scene.first_kind, 0), (scene.first_kind, view)]
+    first, other = _similarities(scene, poses, images, imaging)
+    return other >= _FITS * first
+
+
 def _explained(
     scene: Scene, poses: Poses, image: tuple[Kind, int], fits: dict[tuple[Kind, int], float], imaging: Imaging
 ) -> Misfit:

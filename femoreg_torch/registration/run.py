@@ -18,6 +18,7 @@ from femoreg_torch.detect import detect, load_network
 from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import CArm, Poses, check_rigid
+from femoreg_torch.registration.another_view import start_from_a_view
 from femoreg_torch.registration.doubts import doubts
 from femoreg_torch.registration.kernels import load_kernels
 from femoreg_torch.registration.plan import Plan, load_plan
@@ -27,7 +28,6 @@ from femoreg_torch.registration.scene import Scene
 from femoreg_torch.registration.start import (
     Detector,
     look_at,
-    start_by_detection,
     start_by_landmarks,
     with_segmentations,
 )
@@ -148,7 +148,7 @@ def register_scene(
         scene = _started_at(scene, start)
     clock["prepared"] = time.perf_counter()
     look = find if network is None else network.result()
-    began, scene = _start(case, scene, plan, look, landmarks, report)
+    began, scene = _start(case, scene, plan, look, landmarks, seed, report)
     clock["started"] = time.perf_counter()
     anchor = began.camera1_from_object if scene.needs_landmarks else None
     if follow is not None:
@@ -234,6 +234,7 @@ def _start(
     plan: Plan,
     look: Detector | None,
     landmarks: Mapping[str, Tensor] | None,
+    seed: int,
     report: Report,
 ) -> tuple[StartRecord, Scene]:
     """The pose that the objects are placed by, and the scene with what the network sees, if a stage asks for it."""
@@ -252,7 +253,8 @@ def _start(
         began = start_by_landmarks(case, scene.anchor, landmarks)
     else:
         assert seen is not None  # looked at above
-        began = start_by_detection(case, scene, seen, look)
+        assert look is not None
+        began = start_from_a_view(case, scene, plan, seen, look, seed)
     if plan.needs_segmentations and seen is not None and look is not None:
         scene = with_segmentations(scene, seen, look)
     return began, scene

@@ -37,6 +37,7 @@ _LEAST_AMONG_VIEWS, _MOST_DEG_AMONG_VIEWS = 0.75, 16.0
 # outlines. Outlines mend what is more open (9° open: 2 to 3° off afterwards).
 MOST_ROTATION_DEG = 5.0
 _MIRRORED = Display(mirrored=True)
+_FEW, _NETWORK, _OUTLINES = "few ", "landmarks of the network", ", outlines"  # words of where a start comes from
 _FEW_GREYS = 16  # pictures of 16 bits of a stout patient held 300, one of 8 bits two
 _OF_8_BITS = 256
 _ASKED_PX = 200_000
@@ -146,7 +147,16 @@ def _told_turned(case: Case, scene: Scene, anatomy: Anatomy, find: Detector) -> 
 
 def _told_other_view(case: Case, scene: Scene, anatomy: Anatomy, find: Detector) -> tuple[str, ...]:
     """In words, which of the other views shows most landmarks that agree; nothing where none shows enough of them."""
-    agree: dict[int, int] = {}
+    best = best_other_view(case, scene, anatomy, find)
+    if best is None:
+        return ()
+    view, start = best
+    return (f"View {view + 1} shows {int(start.pnp.inliers.sum())} landmarks that agree: list it first under `views`.",)
+
+
+def best_other_view(case: Case, scene: Scene, anatomy: Anatomy, find: Detector) -> tuple[int, Start] | None:
+    """The view (from 0), not the first, that shows most landmarks that agree, and its start; None if there is none."""
+    found: dict[int, Start] = {}
     for _, view in scene.there([scene.first_kind], range(1, scene.views)):
         image, field, beam = (
             scene.image(scene.first_kind, view),
@@ -160,11 +170,11 @@ def _told_other_view(case: Case, scene: Scene, anatomy: Anatomy, find: Detector)
         except InputError:
             continue
         if not start.few:
-            agree[view] = int(start.pnp.inliers.sum())
-    if not agree:
-        return ()
-    best = max(agree, key=lambda view: agree[view])
-    return (f"View {best + 1} shows {agree[best]} landmarks that agree: list it first under `views`.",)
+            found[view] = start
+    if not found:
+        return None
+    best = max(found, key=lambda view: int(found[view].pnp.inliers.sum()))
+    return best, found[best]
 
 
 def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) -> StartRecord:
@@ -387,9 +397,19 @@ def _record(anchor: str, detection: Detection, start: Start, names: tuple[str, .
         )
         for i, name in enumerate(names)
     }
-    source = ("few " if start.few else "") + "landmarks of the network"
-    source += ", outlines" if start.overlap is not None else ""
+    source = (_FEW if start.few else "") + _NETWORK + (_OUTLINES if start.overlap is not None else "")
     return StartRecord(anchor, start.camera_from_ct, source, marks, start.pnp.rms_px, start.overlap)
+
+
+def by_few_landmarks(start: StartRecord) -> bool:
+    """Whether a start is that of the outlines, as there were too few landmarks for a pose."""
+    return start.source.startswith(_FEW)
+
+
+def record_from_view(view: int, anchor: str, camera1_from: Tensor, start: Start) -> StartRecord:
+    """A start in camera 1 that was found from another view (from 0); its landmarks, in that image, are left out."""
+    source = f"{_NETWORK} in view {view + 1}{_OUTLINES if start.overlap is not None else ''}, and from there view 1"
+    return StartRecord(anchor, camera1_from, source, {}, start.pnp.rms_px, start.overlap)
 
 
 def _pair(pixel: Tensor) -> tuple[float, float]:
