@@ -19,6 +19,7 @@ from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import CArm, Poses, check_rigid
 from femoreg_torch.registration.another_view import start_from_a_view
+from femoreg_torch.registration.display_told import doubts_about_the_display
 from femoreg_torch.registration.doubts import doubts
 from femoreg_torch.registration.kernels import load_kernels
 from femoreg_torch.registration.plan import Plan, load_plan
@@ -190,6 +191,11 @@ def register_scene(
         seed=seed,
         versions=versions(),
     )
+    if not result.verdict.trusted and told.needs_landmarks and landmarks is None:
+        assert look is not None  # it found the start
+        report("asking how view 1 was taken", 1.0)
+        why = doubts_about_the_display(case, told, plan, look, outcome.trace, seed)
+        result = replace(result, doubts=(*why, *result.doubts))
     return result, scene
 
 

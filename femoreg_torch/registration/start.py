@@ -151,7 +151,8 @@ def _told_other_view(case: Case, scene: Scene, anatomy: Anatomy, find: Detector)
     if best is None:
         return ()
     view, start = best
-    return (f"View {view + 1} shows {int(start.pnp.inliers.sum())} landmarks that agree: list it first under `views`.",)
+    agree = int(start.pnp.inliers.sum())
+    return (f"View {view + 1} shows {agree} landmarks that agree: list it first, and tell poses in its camera.",)
 
 
 def best_other_view(case: Case, scene: Scene, anatomy: Anatomy, find: Detector) -> tuple[int, Start] | None:

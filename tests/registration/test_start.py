@@ -114,7 +114,7 @@ def test_a_view_that_shows_more_is_asked_to_be_the_first(display: Display) -> No
         return found if torch.equal(shown, images[2]) else detection(3, inverted=False)
 
     three = replace(scene(), images={"anatomy": images})
-    with pytest.raises(InputError, match=r"view1.tif: .*View 3 shows 6 landmarks that agree: list it first"):
+    with pytest.raises(InputError, match=r"view1.tif: .*View 3 shows 6 landmarks that agree: list it first, and"):
         start_by_detection(case, three, detection(3, inverted=False), find)
     with pytest.raises(InputError) as nothing:
         start_by_detection(case, three, detection(3, inverted=False), lambda *_: detection(3, inverted=False))
