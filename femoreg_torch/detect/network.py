@@ -17,7 +17,8 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera
 
 VISIBLE = 0.5  # confidence from which a landmark counts as seen; the confidences are calibrated, see the model card
-_MARGIN = 0.5  # landmarks by which a turned or inverted reading must exceed the plain one
+# Landmarks by which what an image is read as, turned or inverted, must exceed what it is read as plain.
+_MARGIN = 0.5
 # Landmarks from which an image may be found to stand on its head. On six of 60 small fields of another simulator a
 # turned reading exceeded the plain one, with up to three landmarks, all false, as a shaft looks alike either way.
 _LEAST_TURNED = 3.5
@@ -46,12 +47,12 @@ def detect(
 ) -> Detection:
     """Landmarks and bones in an `attenuation` image (H, W) of `camera`: bone bright, patient left on the right.
 
-    The image is read as it is, turned by 180°, and both again with its grey values inverted, and that reading is kept
-    which expects most landmarks; the plain one unless it is exceeded by at least half a landmark, and a turned one only
-    if it expects four (3.5). The network reads either kind of grey values nearly as well, so the rims of the bones that
-    it saw say whether bone is dark. What is kept is then read again with test-time augmentation. Raises `InputError`
-    for an image that does not fit the camera, holds values that are not finite, or is constant. The network computes
-    where it is; what is found lies on the CPU.
+    The image is read as it is, turned by 180°, and both again with its grey values inverted. The network reads either
+    kind of grey values nearly as well, so the mean of the two says which way up the image stands: on its head if it
+    expects half a landmark more so, and four (3.5) in one of them; and the rims of the bones that it saw say whether
+    bone is dark. What is kept is then read again with test-time augmentation. Raises `InputError` for an image that
+    does not fit the camera, holds values that are not finite, or is constant. The network computes where it is; what is
+    found lies on the CPU.
     """
     _check(attenuation, camera)
     image = normalise(to_network_grid(attenuation.to(torch.float32), camera)).to(network.device)
@@ -94,9 +95,16 @@ def _oriented(image: Tensor, turned: bool, inverted: bool) -> Tensor:
 
 
 def _most_landmarks(expected: Mapping[tuple[bool, bool], float]) -> tuple[bool, bool]:
-    """Which reading, (turned, inverted), to keep of those that expect so many landmarks."""
-    asked = [key for key in expected if not key[0] or expected[key] >= _LEAST_TURNED]
-    return max(asked, key=lambda key: expected[key] - _MARGIN * any(key))
+    """Which reading, (turned, inverted), to keep of those that expect so many landmarks.
+
+    Of 286 upright views of three other simulators two were taken to stand on their head; seven by the best reading
+    alone, one of them an ordinary hip that was read best turned and inverted at once. Turned by 180°, none of those
+    that show four landmarks was taken to stand upright, and two by the best reading.
+    """
+    upright, on_its_head = ((expected[turned, False] + expected[turned, True]) / 2 for turned in (False, True))
+    most = max(expected[True, False], expected[True, True])
+    turned = on_its_head > upright + _MARGIN and most >= _LEAST_TURNED
+    return turned, expected[turned, True] > expected[turned, False] + _MARGIN
 
 
 def _expected_landmarks(reading: LogProbabilities) -> float:

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import LandmarkNetwork, decode_heatmaps, detect, load_network, network_camera
 from femoreg_torch.detect.decode import expected_error
+from femoreg_torch.detect.network import _most_landmarks
 from femoreg_torch.detect.tta import PLAIN
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, invert_rigid, load_carm, project_points, rotation_angle, transform_points
@@ -46,25 +47,29 @@ def planted(pixels: Tensor, visible: Tensor) -> Prediction:
 
 
 class Planted(nn.Module):
-    """Answers with what was planted, whatever it is shown; with no landmark for the image turned by 180°."""
+    """Answers with what was planted, bright bone or dark; with no landmark for the image turned by 180°."""
 
-    def __init__(self, prediction: Prediction, top_is_bright: bool) -> None:
+    def __init__(self, prediction: Prediction) -> None:
         super().__init__()
-        self.prediction, self.top_is_bright = prediction, top_is_bright
+        self.prediction = prediction
 
     def forward(self, image: Tensor) -> Prediction:
-        upright = bool(image[0, 0, :96].mean() > 0) == self.top_is_bright
+        striped = image.diff(dim=2).abs()
+        upright = bool(striped[0, 0, :96].mean() > striped[0, 0, 96:].mean())
         return self.prediction if upright else self.prediction._replace(absence=torch.full((1, LANDMARKS), 20.0))
 
 
 def planting(pixels: Tensor, visible: Tensor) -> LandmarkNetwork:
     """A network that knows the image of `image()` the right way up."""
-    return LandmarkNetwork(Planted(planted(pixels, visible), True))
+    return LandmarkNetwork(Planted(planted(pixels, visible)))
 
 
 @pytest.fixture
 def image() -> Tensor:
-    return torch.linspace(1, 0, CAMERA.shape[0])[:, None].expand(CAMERA.shape).contiguous()
+    """Brighter towards its top, whose half is striped."""
+    rows = torch.arange(CAMERA.shape[0])
+    stripes = 0.05 * (rows // 16 % 2) * (rows < CAMERA.shape[0] // 2)
+    return (1 - rows / CAMERA.shape[0] + stripes)[:, None].expand(CAMERA.shape).contiguous()
 
 
 def test_sub_pixel_positions_and_confidence() -> None:
@@ -122,6 +127,14 @@ def test_a_few_landmarks_do_not_stand_an_image_on_its_head(shown: int, turned: b
     visible = torch.arange(LANDMARKS) < shown
     assert detect(planting(truth, visible), image, CAMERA, PLAIN).visible.sum() > 0
     assert detect(planting(truth, visible), image.rot90(2), CAMERA, PLAIN).turned == turned
+
+
+def test_one_reading_that_is_turned_and_inverted_does_not_stand_an_image_on_its_head() -> None:
+    """As of an ordinary hip: both upright readings expected 3.5 landmarks, and turned and inverted at once 4.3."""
+    expected = {(False, False): 3.5, (False, True): 3.5, (True, False): 0.9, (True, True): 4.3}
+    assert _most_landmarks(expected) == (False, False)
+    turned = {(not turned, inverted): most for (turned, inverted), most in expected.items()}
+    assert _most_landmarks(turned) == (True, False)
 
 
 def test_the_segmentations_camera(image: Tensor) -> None:
