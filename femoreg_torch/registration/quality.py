@@ -12,6 +12,7 @@ points leaves it open beside the other objects; and of the C-arm itself, whether
 its file says. Eighth, of a device, whether the images tell its turn about its long axis (`registration.turns`).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -37,6 +38,7 @@ from femoreg_torch.similarity import GradNcc
 _LEVEL = Level(pixel_mm=1.55, step_mm=0.5)
 _SIMILARITY = GradNcc(patch_radius=5)
 _PROBE_MM = 0.6  # about half a pixel of the level, at the object
+_NO_PEAK_MM = 50.0  # a step so far is that of a slope without a peak nearby
 
 
 @dataclass(frozen=True)
@@ -293,9 +295,9 @@ def _loose(name: str, anchor: str, covariance: PoseCovariance, limits: Limits) -
 def _reason(name: str, views: Sequence[ViewQuality], limits: Limits) -> str | None:
     for view in views:
         x, y = view.pull_mm
-        if not torch.isfinite(torch.tensor(view.pull_mm)).all():
+        if not math.hypot(x, y) < _NO_PEAK_MM:  # nan too
             return f"view {view.view} does not hold the {name}: its similarity has no peak near the solution"
-        if (x * x + y * y) ** 0.5 > limits.most_pull_mm:
+        if math.hypot(x, y) > limits.most_pull_mm:
             return f"view {view.view} would move the {name} by ({x:.1f}, {y:.1f}) mm in its image plane"
         if view.gain < limits.least_gain:
             return f"drawing the {name} in view {view.view} explains hardly more of the image (gain {view.gain:.4f})"

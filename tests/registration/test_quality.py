@@ -1,6 +1,7 @@
 """Trust: given at the truth, withheld where a pose is wrong or an object cannot be seen."""
 
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -9,12 +10,13 @@ from registration_scenes import REFERENCE_POINTS, float64, make_scene, off, true
 from torch import Tensor
 
 from femoreg_torch.case import Start
+from femoreg_torch.case.quality import ViewQuality
 from femoreg_torch.case.trace import Restart, StageRecord
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.quality import Limits, _Judged, _unsettled, _unturned, assess
+from femoreg_torch.registration.quality import Limits, _Judged, _reason, _unsettled, _unturned, assess
 from femoreg_torch.registration.run import _started_at
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.registration.turns import loss_by_turning
@@ -170,3 +172,20 @@ def test_a_device_is_turned_about_what_is_in_view(scene: Scene) -> None:
     )
     assert found > 0.05
     assert blind < 0.01
+
+
+@pytest.mark.parametrize(
+    ("pull_mm", "says"),
+    [
+        ((3.0, -4.0), r"view 2 would move the femur by \(3.0, -4.0\) mm"),
+        ((-23.6, -5171.8), "view 2 does not hold the femur"),
+        ((math.nan, 0.0), "view 2 does not hold the femur"),
+        ((0.1, 0.1), None),
+    ],
+)
+def test_a_step_that_no_peak_nearby_explains_is_not_told_as_a_distance(
+    pull_mm: tuple[float, float], says: str | None
+) -> None:
+    views = (ViewQuality(1, 0.7, 0.1, (0.0, 0.0)), ViewQuality(2, 0.7, 0.1, pull_mm))
+    reason = _reason("femur", views, LIMITS)
+    assert (reason is None) if says is None else re.match(says, reason or "")
