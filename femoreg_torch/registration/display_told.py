@@ -22,8 +22,8 @@ from femoreg_torch.registration.start import Detector, find_start, look_at
 from femoreg_torch.registration.workflow import run_plan
 
 # Of the mean patch Grad-NCC, after the stages of view 1. In five cases of two foreign simulators, with the source in
-# front and behind, told and not, the right display fitted better than any other by 0.08 to 0.11. In one more, whose start
-# was wrong (a pelvis 17° off), a wrong display did by 0.06.
+# front and behind, told and not, the right display fitted better than any other by 0.08 to 0.11. In one more, whose
+# start was wrong (a pelvis 17° off), a wrong display did by 0.06.
 _BETTER = 0.07
 _FRONT_AND_BACK: tuple[Source, ...] = ("anterior", "posterior")  # views from a side start from the same side alone
 
