@@ -15,10 +15,12 @@ from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
 from femoreg_torch.fluoro.display import Source
+from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.plan import Plan
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.registration.stage import Stage
 from femoreg_torch.registration.start import Detector, find_start, look_at
+from femoreg_torch.registration.step import Step
 from femoreg_torch.registration.workflow import run_plan
 
 # Of the mean patch Grad-NCC, after the stages of view 1. In five cases of two foreign simulators, with the source in
@@ -34,9 +36,10 @@ def doubts_about_the_display(
     """In words, whether the bones fit view 1 better with the source on the other side, or the picture mirrored.
 
     `told` is the scene before the registration, whose `trace` says how well the bones fit view 1 as the case tells it.
+    Nothing is asked of plans that search view 1 without derivatives, which takes minutes.
     """
     display = case.display_of(0)
-    steps = tuple(takewhile(lambda step: isinstance(step, Stage) and step.images == "first", plan.steps))
+    steps = tuple(takewhile(_quick_of_view_1, plan.steps))
     ended = [record.cost for record in trace if steps and record.name == steps[-1].name]
     if display.source not in _FRONT_AND_BACK or not ended:
         return ()
@@ -58,6 +61,10 @@ def doubts_about_the_display(
         f"{1 - costs[best]:.2f} against {1 - ended[-1]:.2f} as the case tells it), which may be what other doubts "
         "come from: check `display` of the views, and whether the CT is mirrored",
     )
+
+
+def _quick_of_view_1(step: Step) -> bool:
+    return isinstance(step, Stage) and step.images == "first" and isinstance(step.optimiser, LevenbergMarquardt)
 
 
 def _cost(case: Case, told: Scene, plan: Plan, find: Detector, display: Display, seed: int) -> float:
