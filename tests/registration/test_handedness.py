@@ -6,6 +6,7 @@ import pytest
 import torch
 from registration_scenes import CARM, REFERENCE_POINTS, VOLUMES, float64, make_scene, off, true_poses
 
+from femoreg_torch import registration
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import transform_points
 from femoreg_torch.registration import Scene
@@ -61,6 +62,18 @@ def test_a_mirrored_object_is_doubted_though_it_is_a_little_off(scene: Scene) ->
     here = off(TRUTH.camera1_from["pelvis"], REFERENCE_POINTS["pelvis"], (1, -1, 1), (1, -1, 3))
     (doubt,) = doubts_about_handedness(wrong, wrong, TRUTH.with_object("pelvis", here), PLAIN)
     assert "the pelvis fits the images better mirrored" in doubt
+
+
+def test_a_plane_that_changes_an_object_hardly_more_is_tried_as_well(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The right mirror image lies 9 mm away, where it fits a little worse at first than one that changes nothing."""
+    told, true = mirror_images(VOLUMES["pelvis"])[2], VOLUMES["pelvis"]
+    place = true.lps_from_index.clone()
+    place[:3, 3] += float64(8.15, -4.075, 0)
+    monkeypatch.setattr(registration.handedness, "mirror_images", lambda _: [told, Volume(true.data, place)])
+    fits = handedness(with_volume(scene, "pelvis", told), TRUTH, "pelvis", PLAIN)
+    assert fits.mirrored > fits.similarity + 0.3
 
 
 def test_what_is_its_own_mirror_image_is_not_doubted(scene: Scene) -> None:
