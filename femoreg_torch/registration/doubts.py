@@ -197,7 +197,7 @@ def doubts_about_the_views(scene: Scene, poses: Poses) -> tuple[str, ...]:
     """Views whose C-arm was found where no orbit leads, in words; none where its poses are given."""
     if scene.camera_from_camera1 is not None:
         return ()
-    orbit = orbits(scene, poses, _ORBIT_DEG)
+    orbit = torch.cat(orbits(scene, poses, _ORBIT_DEG))
     isocentre = torch.tensor(scene.carm.isocentre_mm, dtype=torch.float64)
     told = []
     for view, found in enumerate(poses.camera_from_camera1[1:], 2):

@@ -135,25 +135,30 @@ def _further(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> "_Be
     level = search.level
     coarser = replace(level, pixel_mm=_COARSER_PIXEL * level.pixel_mm, step_mm=_COARSER_STEP * level.step_mm)
     middle = _middle(scene, poses)
-    around = orbits(scene, poses, search.further_deg)
-    found = _best(scene, poses, replace(search, level=coarser), view, around, _FURTHER_SHIFT * search.shift_mm)
+    coarse, shift_mm = replace(search, level=coarser), _FURTHER_SHIFT * search.shift_mm
+    # by themselves: shifted images of one orbit, whose isocentre is not where the file says, correlated best with all
+    every = [_best(scene, poses, coarse, view, orbit, shift_mm) for orbit in orbits(scene, poses, search.further_deg)]
+    found = min(every, key=lambda each: each.cost)
     grid = torch.cartesian_prod(*(torch.linspace(*each, dtype=torch.float64) for each in _ABOUT_DEG))
     centre = transform_points(found.camera_from_camera1, middle[None])[0]
     about = about_point(rigid(exp_so3(torch.deg2rad(grid))), centre) @ found.camera_from_camera1
     best = _best(scene, poses, search, view, about, _ABOUT_SHIFT * search.shift_mm)
-    return replace(best, tries=found.tries + best.tries)
+    return replace(best, tries=best.tries + sum(each.tries for each in every))
 
 
-def orbits(scene: Scene, poses: Poses, half_range_deg: float) -> Tensor:
-    """Poses (N, 4, 4) of the C-arm from view 1: along its orbit, and turned and tilted about the middle of view 1.
+def orbits(scene: Scene, poses: Poses, half_range_deg: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Poses (N, 4, 4) of the C-arm from view 1: along its orbit, and turned, or tilted too, about the middle of view 1.
 
     Who centres the hip again after the turn brings the middle back there, whatever the C-arm turned about.
     """
     angles, middle = orbit_angles(half_range_deg, _TURN_STEP_DEG), _middle(scene, poses)
     about_middle = replace(scene.carm, isocentre_mm=(0.0, 0.0, float(middle[2])))
-    orbits_of_the_file = torch.cat([scene.carm.orbit(angles), about_middle.orbit(angles)])
     fewer = orbit_angles(min(half_range_deg, _MOST_TURN_OF_TILTED_DEG), _TURN_STEP_DEG)
-    return torch.cat([orbits_of_the_file, tilted(poses.camera1_from[scene.anchor], middle, fewer)])
+    return (
+        scene.carm.orbit(angles),
+        about_middle.orbit(angles),
+        tilted(poses.camera1_from[scene.anchor], middle, fewer),
+    )
 
 
 def _middle(scene: Scene, poses: Poses) -> Tensor:
