@@ -22,10 +22,11 @@ from femoreg_torch.registration.stage import Stage
 from femoreg_torch.registration.start import (
     Detector,
     best_other_view,
-    by_few_landmarks,
     look_at,
     record_from_view,
-    start_by_detection,
+    record_from_view_1,
+    start_in_view_1,
+    why_there_is_no_start,
     with_segmentations,
 )
 from femoreg_torch.registration.step import Step
@@ -42,16 +43,18 @@ def start_from_a_view(
     Another view is asked where view 1 has no start or one of few landmarks. Raises `InputError` as `start_by_detection`
     does, if no other view has a start or view 1 does not fit what is found from there.
     """
+    refused: InputError | None = None
     try:
-        found = start_by_detection(case, scene, detection, find)
-    except InputError:
-        other = _from_another_view(case, scene, plan, find, seed)
-        if other is None:
-            raise
+        found = start_in_view_1(case, scene, detection)
+        if not found.few:
+            return record_from_view_1(case, scene, detection, found)
+    except InputError as error:
+        refused = error
+    if (other := _from_another_view(case, scene, plan, find, seed)) is not None:
         return other
-    if by_few_landmarks(found):
-        return _from_another_view(case, scene, plan, find, seed) or found
-    return found
+    if refused is not None:
+        raise why_there_is_no_start(case, scene, refused, find) from refused
+    return record_from_view_1(case, scene, detection, found)
 
 
 def _from_another_view(case: Case, scene: Scene, plan: Plan, find: Detector, seed: int) -> StartRecord | None:

@@ -37,7 +37,7 @@ _LEAST_AMONG_VIEWS, _MOST_DEG_AMONG_VIEWS = 0.75, 16.0
 # outlines. Outlines mend what is more open (9° open: 2 to 3° off afterwards).
 MOST_ROTATION_DEG = 5.0
 _MIRRORED = Display(mirrored=True)
-_FEW, _NETWORK, _OUTLINES = "few ", "landmarks of the network", ", outlines"  # words of where a start comes from
+_NETWORK, _OUTLINES = "landmarks of the network", ", outlines"  # words of where a start comes from
 _FEW_GREYS = 16  # pictures of 16 bits of a stout patient held 300, one of 8 bits two
 _OF_8_BITS = 256
 _ASKED_PX = 200_000
@@ -71,37 +71,46 @@ def start_by_detection(case: Case, scene: Scene, detection: Detection, find: Det
     Raises `InputError` as `find_start` does, with the image's name, and how the image would have to be turned, or which
     view to put first, if `find` then sees landmarks that agree.
     """
-    image, field = scene.image(scene.first_kind, 0), scene.field(scene.first_kind, 0)
-    anatomy = case.anatomy or HIP
     try:
-        start = find_start(
-            case.landmarks,
-            detection,
-            image,
-            case.carm.camera,
-            scene.outline,
-            anatomy,
-            field,
-            case.display_of(0).beam,
-            among_views=scene.views > 1,
-        )
+        return record_from_view_1(case, scene, detection, start_in_view_1(case, scene, detection))
     except InputError as error:
-        seen = f"{case.views[0].images[scene.first_kind]}: {error}"
-        if (greys := _greys_where_dense(image, field)) is not None:
-            raise InputError(
-                f"{case.views[0].images[scene.first_kind]}: half of the picture, where the patient is dense, holds no "
-                f"more than {greys} grey value{'s' * (greys != 1)}, so hardly a bone is to be seen. Is it of 8 bits, "
-                "in proportion to the light? Export it with 16 bits, or its logarithm."
-            ) from error
-        other = () if find is None else _told_other_view(case, scene, anatomy, find)
-        if case.display_of(0).source in ("left", "right"):
-            raise InputError(" ".join([seen.removesuffix(_BY_HAND).rstrip(), _OF_A_SIDE, *other])) from error
-        turned = () if find is None else _told_turned(case, scene, anatomy, find)
-        raise InputError(" ".join([seen, *(turned or other)])) from error
-    stored = case.display_of(0).pixels_to_stored(detection.pixels, case.carm.camera)
-    if (distortion := view_distortion(case, 0)) is not None:
-        stored = torch.from_numpy(distortion.bent(stored.numpy()))
-    return _record(scene.anchor, replace(detection, pixels=stored), start, anatomy.landmark_names)
+        raise why_there_is_no_start(case, scene, error, find) from error
+
+
+def start_in_view_1(case: Case, scene: Scene, detection: Detection) -> Start:
+    """The start by what the network sees in view 1. Raises `InputError` as `find_start` does."""
+    return find_start(
+        case.landmarks,
+        detection,
+        scene.image(scene.first_kind, 0),
+        case.carm.camera,
+        scene.outline,
+        case.anatomy or HIP,
+        scene.field(scene.first_kind, 0),
+        case.display_of(0).beam,
+        among_views=scene.views > 1,
+    )
+
+
+def why_there_is_no_start(case: Case, scene: Scene, error: InputError, find: Detector | None) -> InputError:
+    """The refusal of view 1 by `error` with the image's name, and what would help.
+
+    That is how the image would have to be turned, or which view to put first, if `find` then sees landmarks that agree.
+    """
+    image, field = scene.image(scene.first_kind, 0), scene.field(scene.first_kind, 0)
+    anatomy, path = case.anatomy or HIP, case.views[0].images[scene.first_kind]
+    seen = f"{path}: {error}"
+    if (greys := _greys_where_dense(image, field)) is not None:
+        return InputError(
+            f"{path}: half of the picture, where the patient is dense, holds no more than {greys} grey "
+            f"value{'s' * (greys != 1)}, so hardly a bone is to be seen. Is it of 8 bits, in proportion to the light? "
+            "Export it with 16 bits, or its logarithm."
+        )
+    other = () if find is None else _told_other_view(case, scene, anatomy, find)
+    if case.display_of(0).source in ("left", "right"):
+        return InputError(" ".join([seen.removesuffix(_BY_HAND).rstrip(), _OF_A_SIDE, *other]))
+    turned = () if find is None else _told_turned(case, scene, anatomy, find)
+    return InputError(" ".join([seen, *(turned or other)]))
 
 
 def _greys_where_dense(attenuation: Tensor, field: Tensor | None) -> int | None:
@@ -390,21 +399,20 @@ def with_segmentations(scene: Scene, first: Detection, find: Detector) -> Scene:
     return replace(scene, segmentations=seen)
 
 
-def _record(anchor: str, detection: Detection, start: Start, names: tuple[str, ...]) -> StartRecord:
+def record_from_view_1(case: Case, scene: Scene, detection: Detection, start: Start) -> StartRecord:
+    """A start in view 1 with the landmarks of `detection`, in pixels of the image as it is stored."""
+    stored = case.display_of(0).pixels_to_stored(detection.pixels, case.carm.camera)
+    if (distortion := view_distortion(case, 0)) is not None:
+        stored = torch.from_numpy(distortion.bent(stored.numpy()))
     inliers = {name for name, inlier in zip(start.used, start.pnp.inliers.tolist(), strict=True) if inlier}
     marks = {
         name: LandmarkRecord(
-            _pair(detection.pixels[i]), float(detection.confidence[i]), bool(detection.visible[i]), name in inliers
+            _pair(stored[i]), float(detection.confidence[i]), bool(detection.visible[i]), name in inliers
         )
-        for i, name in enumerate(names)
+        for i, name in enumerate((case.anatomy or HIP).landmark_names)
     }
-    source = (_FEW if start.few else "") + _NETWORK + (_OUTLINES if start.overlap is not None else "")
-    return StartRecord(anchor, start.camera_from_ct, source, marks, start.pnp.rms_px, start.overlap)
-
-
-def by_few_landmarks(start: StartRecord) -> bool:
-    """Whether a start is that of the outlines, as there were too few landmarks for a pose."""
-    return start.source.startswith(_FEW)
+    source = ("few " if start.few else "") + _NETWORK + (_OUTLINES if start.overlap is not None else "")
+    return StartRecord(scene.anchor, start.camera_from_ct, source, marks, start.pnp.rms_px, start.overlap)
 
 
 def record_from_view(view: int, anchor: str, camera1_from: Tensor, start: Start) -> StartRecord:

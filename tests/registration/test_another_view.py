@@ -8,7 +8,7 @@ import torch
 from registration_scenes import CARM, REFERENCE_POINTS, error, make_scene, off, quicker, true_poses
 from torch import Tensor
 
-from femoreg_torch.case import Case, StartRecord
+from femoreg_torch.case import Case, StartRecord, View
 from femoreg_torch.detect import Detection
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, rigid
@@ -19,8 +19,8 @@ from femoreg_torch.registration.start import Start
 
 TRUTH = true_poses()
 FOUND = rigid()  # what an own start of view 1 is recognised by
-NONE = torch.zeros(0)
-SEEN = Detection(NONE.view(0, 2), NONE, NONE, NONE.bool(), torch.zeros(1, 8, 8), CARM.camera, False, False)
+EACH = torch.ones(14)
+SEEN = Detection(torch.ones(14, 2).double(), EACH, EACH, EACH.bool(), torch.zeros(1, 8, 8), CARM.camera, False, False)
 
 
 @pytest.fixture(scope="module")
@@ -40,12 +40,18 @@ def pnp(pose: Tensor) -> PnpResult:
 def started(
     scene: Scene, plan: Plan, monkeypatch: pytest.MonkeyPatch, view_1: str | None, other: int | None
 ) -> StartRecord:
-    """The start where view 1 has one of that source, or none, and another view (from 0) one that is 2° off."""
+    """The start where view 1 has one by "few" or "enough" landmarks, or none, and another view one that is 2° off."""
 
-    def of_view_1(*_: object) -> StartRecord:
+    def of_view_1(*_: object) -> Start:
         if view_1 is None:
-            raise InputError("view1.tif: 3 usable landmarks found.")
-        return StartRecord("pelvis", FOUND, view_1)
+            raise InputError("3 usable landmarks found.")
+        return Start(FOUND, pnp(FOUND), ["FH-l"] * 6, 0.97, few=view_1 == "few")
+
+    def why(_case: Case, _scene: Scene, error: InputError, find: object) -> InputError:
+        asked.append(find)
+        return InputError(f"view1.tif: {error}")
+
+    asked: list[object] = []
 
     def of_another(*_: object) -> tuple[int, Start] | None:
         if other is None:
@@ -53,13 +59,16 @@ def started(
         pose = off(TRUTH.camera_from("pelvis")[other], REFERENCE_POINTS["pelvis"], (1.2, -1.2, 1.2), (1, -1, 8))
         return other, Start(pose, pnp(pose), [], 0.97)
 
-    monkeypatch.setattr(another_view, "start_by_detection", of_view_1)
+    monkeypatch.setattr(another_view, "start_in_view_1", of_view_1)
+    monkeypatch.setattr(another_view, "why_there_is_no_start", why)
     monkeypatch.setattr(another_view, "best_other_view", of_another)
-    case = Case(Path("case"), CARM, {}, views=())
-    return start_from_a_view(case, scene, plan, SEEN, lambda *_: SEEN, seed=0)
+    case = Case(Path("case"), CARM, {}, views=(View({"anatomy": Path("view1.tif")}),))
+    start = start_from_a_view(case, scene, plan, SEEN, lambda *_: SEEN, seed=0)
+    assert not asked  # words of a refusal take looks at the other views: none are made where there is a start
+    return start
 
 
-@pytest.mark.parametrize("view_1", [None, "few landmarks of the network, outlines"])
+@pytest.mark.parametrize("view_1", [None, "few"])
 def test_view_1_is_found_from_a_view_that_shows_more(
     scene: Scene, plan: Plan, monkeypatch: pytest.MonkeyPatch, view_1: str | None
 ) -> None:
@@ -73,12 +82,12 @@ def test_view_1_is_found_from_a_view_that_shows_more(
 
 
 def test_a_start_of_view_1_by_landmarks_stays(scene: Scene, plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    start = started(scene, plan, monkeypatch, "landmarks of the network, outlines", other=2)
+    start = started(scene, plan, monkeypatch, "enough", other=2)
     assert torch.equal(start.camera1_from_object, FOUND)
 
 
 def test_few_landmarks_are_better_than_none(scene: Scene, plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    start = started(scene, plan, monkeypatch, "few landmarks of the network, outlines", other=None)
+    start = started(scene, plan, monkeypatch, "few", other=None)
     assert torch.equal(start.camera1_from_object, FOUND)
     with pytest.raises(InputError, match=r"view1.tif: 3 usable"):
         started(scene, plan, monkeypatch, None, other=None)
