@@ -108,11 +108,12 @@ def _checked_table(table: LabelTable, anatomy: Anatomy | None, where: str) -> La
 def read_carm(top: Fields, display: Display, views: Sequence[View]) -> CArm:
     """The C-arm under `carm`: a preset's name, a YAML file beside `case.yaml`, its settings, or `dicom`.
 
-    What it says of pixels is of the images as they are stored; the C-arm that is returned is of those that the source
-    sees. `dicom` stands for what the header of the first image says.
+    What it says of pixels is of the images of view 1 as they are stored, by its own display or the case's; the C-arm
+    that is returned is of those that the source sees. `dicom` stands for what the header of the first image says.
     """
     stored = _stored_carm(top, views)
-    return replace(stored, camera=display.camera(stored.camera))
+    first = (views[0].display if views else None) or display
+    return replace(stored, camera=first.camera(stored.camera))
 
 
 def _stored_carm(top: Fields, views: Sequence[View]) -> CArm:

@@ -1,7 +1,13 @@
 """What was measured at a solution about every object in every view, and whether it is trusted."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+
+def largest(deviations: Sequence[float]) -> float:
+    """The largest of them; nan if one is, or there are none. Python's `max` drops a nan that is not the first."""
+    return math.nan if not deviations or any(map(math.isnan, deviations)) else max(deviations)
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,8 @@ def write_case(folder: Path, case: Case, standing: Path | None = None) -> None:
         content["objects"] = {name: _object(thing, base) for name, thing in case.objects.items()}
         if case.plan is not None:
             content["plan"] = _plan(case.plan, base)
-    content["carm"] = _carm(replace(case.carm, camera=case.display.stored_camera(case.carm.camera)))
+    first = case.display_of(0) if case.views else case.display
+    content["carm"] = _carm(replace(case.carm, camera=first.stored_camera(case.carm.camera)))
     content |= display_content(case.display)
     if case.views:
         content["views"] = [_view(view, base, case.template is not None) for view in case.views]

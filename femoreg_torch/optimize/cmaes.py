@@ -1,5 +1,6 @@
 """CMA-ES: global enough to find the basin, batched over its population."""
 
+import math
 import warnings
 from dataclasses import dataclass
 
@@ -34,13 +35,16 @@ class CmaEs:
             warnings.simplefilter("ignore", UserWarning)
             import cma  # takes most of a second, and few presets use it
         track = BestSoFar(objective)
+        generator = np.random.default_rng(seed % 2**64)
         options = {
             "popsize": self.population,
             "tolx": self.tol_x,
             "tolfun": self.tol_f,
             "tolfunhist": self.tol_f / 10,
             "maxfevals": self.max_evaluations,
-            "seed": 1 + seed % (2**32 - 1),  # of 32 bits; 0 would mean: from the clock
+            # NumPy's own generator, which `cma` seeds and draws from by default, is one for all threads.
+            "seed": math.nan,
+            "randn": lambda *shape: generator.standard_normal(shape),
             "verbose": -9,
         }
         strategy = cma.CMAEvolutionStrategy(np.zeros(n), 1.0, options)

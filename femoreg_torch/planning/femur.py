@@ -82,11 +82,20 @@ class Femur:
 
         Where the CT cuts the shaft there is no surface.
         """
-        half = float(self.spacing.min()) / 2
         padded = np.pad(self.mask, ((0, 0), (0, 0), (1, 1)), mode="edge")
-        inside = ndimage.distance_transform_edt(padded, sampling=self.spacing)[:, :, 1:-1]
-        outside = ndimage.distance_transform_edt(~padded, sampling=self.spacing)[:, :, 1:-1]
-        return np.where(self.mask, inside - half, half - outside)
+        inside, outside = (self._to_surface(of)[:, :, 1:-1] for of in (padded, ~padded))
+        return np.where(self.mask, inside, -outside)
+
+    def _to_surface(self, mask: NDArray[np.bool_]) -> Array:
+        """mm from voxels of a mask to where the nearest voxel beside it begins: half an edge before its centre.
+
+        Half of which edge follows from the direction it lies in; slices may be thicker than their pixels.
+        """
+        far, nearest = ndimage.distance_transform_edt(mask, sampling=self.spacing, return_indices=True)
+        own = np.indices(mask.shape, sparse=True)
+        steps = [(there - here) * edge for there, here, edge in zip(nearest, own, self.spacing, strict=True)]
+        halves = sum((step * edge) ** 2 for step, edge in zip(steps, self.spacing, strict=True)) ** 0.5 / 2
+        return np.asarray(far - halves / np.maximum(far, np.finfo(float).tiny))
 
 
 def cut_out(ct: Volume, labels: Volume, bone: int, head: Array, side: Side, shaft_mm: float) -> Femur:

@@ -70,13 +70,13 @@ class PoseCovariance:
 
     def deviations(self, name: str) -> tuple[list[float], list[float]]:
         """Standard deviations of one body: rotation (3) in degrees, translation (3) in mm."""
-        sigma = self.of(name).diagonal().sqrt().tolist()
+        sigma = self.of(name).diagonal().clamp(min=0).sqrt().tolist()  # below zero by rounding; nan stays
         return sigma[:3], sigma[3:]
 
     def by_images(self, name: str) -> tuple[list[float], list[float]]:
         """As `deviations`, were the intrinsics certain."""
         i = 6 * self.bodies.index(name)
-        sigma = self.images.diagonal()[i : i + 6].sqrt().tolist()
+        sigma = self.images.diagonal()[i : i + 6].clamp(min=0).sqrt().tolist()
         return sigma[:3], sigma[3:]
 
     def relative_mm(self, name: str, other: str) -> list[float]:
@@ -153,9 +153,9 @@ def pose_covariance(
     model = _first(every, rigid + len(refined.free))
     inverse = torch.linalg.pinv(model.hessian[:rigid, :rigid], hermitian=True)
     by_materials = inverse @ every.hessian[:rigid, len(model.hessian) :]
-    clusters = len(model.scores) / (len(model.scores) - 1)
+    clusters = len(model.scores) / max(1, len(model.scores) - 1)  # one image of one tile has no spread
     scores = _by_place(parts, [view for _, view in images])[:, :rigid]
-    of_places = len(scores) / max(1, len(scores) - 1)  # one image of one tile has no spread
+    of_places = len(scores) / max(1, len(scores) - 1)
     by_images = of_places * inverse @ (scores.T @ scores) @ inverse + by_materials @ by_materials.T
     of_intrinsics = profile(model, refined)
     mean, spread = _estimate(of_intrinsics, clusters, refined)

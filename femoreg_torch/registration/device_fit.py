@@ -118,10 +118,11 @@ def _scatter_ratio(scene: Scene, poses: Poses, seen: list["View"], fit: Doubles,
         if dark.sum() < LEAST_PIXELS:
             continue
         camera = poses.camera(view.pair.view, LEVEL.camera(scene.carm.camera))
-        names = scene.shown(poses.camera1_from, scene.first_kind)
-        placed = torch.stack([poses.camera_from(name)[view.pair.view] for name in names])[None]
-        bones = project([scene.objects[name].volume.to(CPU) for name in names], placed, camera, LEVEL.step_mm)
-        drawn = bones.flatten().double().numpy()[view.pixels]
+        drawn = np.zeros(len(view.pixels))
+        if names := scene.shown(poses.camera1_from, scene.first_kind):
+            placed = torch.stack([poses.camera_from(name)[view.pair.view] for name in names])[None]
+            bones = project([scene.objects[name].volume.to(CPU) for name in names], placed, camera, LEVEL.step_mm)
+            drawn = bones.flatten().double().numpy()[view.pixels]
         scattered = view.corners @ fit[scatter_of(n, regions)]
         primary = np.maximum(view.without - scattered, 1e-3 * view.without) * np.exp(drawn)
         found.append(np.median((scattered / primary)[dark]))

@@ -162,11 +162,13 @@ def orbits(scene: Scene, poses: Poses, half_range_deg: float) -> tuple[Tensor, T
 
 
 def _middle(scene: Scene, poses: Poses) -> Tensor:
-    """Where that object has its reference point (3,) which stands nearest to the middle of view 1."""
+    """Where that object has its reference point (3,) which stands nearest to the middle of view 1.
+
+    Of objects that the first kind of images shows, if it shows any.
+    """
+    shown = scene.shown(poses.camera1_from, scene.first_kind) or tuple(poses.camera1_from)
     points = [
-        transform_points(pose, scene.objects[name].reference_point[None])[0]
-        for name, pose in poses.camera1_from.items()
-        if scene.first_kind in scene.objects[name].shown_in
+        transform_points(poses.camera1_from[name], scene.objects[name].reference_point[None])[0] for name in shown
     ]
     return min(points, key=lambda point: float(point[:2].norm() / point[2]))
 

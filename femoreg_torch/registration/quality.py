@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.case import Case
-from femoreg_torch.case.quality import CameraQuality, ObjectQuality, ViewQuality
+from femoreg_torch.case.quality import CameraQuality, ObjectQuality, ViewQuality, largest
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.fluoro import Display
@@ -272,10 +272,11 @@ def _unsettled(name: str, judged: _Judged, limits: Limits) -> str | None:
 
 def _vague(name: str, rotation: Sequence[float], translation: Sequence[float], limits: Limits) -> str | None:
     """What the images leave open; nan counts as open."""
-    if not max(translation) <= limits.most_deviation_mm:
-        return f"the images fix the {name} to {max(translation):.1f} mm only (standard deviation along one axis)"
-    if not max(rotation) <= limits.most_deviation_deg:
-        return f"the images fix the {name} to {max(rotation):.1f}° only (standard deviation about one axis)"
+    mm, degrees = largest(translation), largest(rotation)
+    if not mm <= limits.most_deviation_mm:
+        return f"the images fix the {name} to {mm:.1f} mm only (standard deviation along one axis)"
+    if not degrees <= limits.most_deviation_deg:
+        return f"the images fix the {name} to {degrees:.1f}° only (standard deviation about one axis)"
     return None
 
 
@@ -283,7 +284,7 @@ def _loose(name: str, anchor: str, covariance: PoseCovariance, limits: Limits) -
     """What not knowing the C-arm leaves open between two objects; nan counts as open."""
     if anchor not in covariance.bodies:
         return None
-    deviation = max(covariance.relative_mm(name, anchor))
+    deviation = largest(covariance.relative_mm(name, anchor))
     if deviation <= limits.most_deviation_mm:
         return None
     return (

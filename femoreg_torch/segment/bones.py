@@ -1,5 +1,6 @@
 """The bones of a CT: labels on its own grid, how sure they are, and what to look at before they are used."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,10 +69,7 @@ def segment_bones_without_network(ct: Volume, refine: bool = True) -> Segmentati
     cut = bones_without_network(ct, HIP)
     if refine:
         grid = resample_isotropic(ct, _SHARES_MM)
-        shares = [
-            F.interpolate((cut.data == k)[None, None].float(), grid.data.shape, mode="area")[0, 0]
-            for k in range(1 + len(HIP.bones))
-        ]
+        shares = [_averaged(cut.with_data((cut.data == k).float()), grid) for k in range(1 + len(HIP.bones))]
         data = refined_labels(ct, torch.stack(shares), grid, HIP)
     else:
         z, y, x = (
@@ -82,6 +80,14 @@ def segment_bones_without_network(ct: Volume, refine: bool = True) -> Segmentati
         )
         data = cut.data[z][:, y][:, :, x]
     return _looked_at(ct, data, HIP, {}, bright_ml)
+
+
+def _averaged(mask: Volume, grid: Volume) -> Tensor:
+    """A mask averaged on the voxels of `grid`, whose first outer faces are the mask's; the far ones need not be."""
+    more = math.ceil(max(grid.spacing_mm) / min(mask.spacing_mm))
+    beyond = F.pad(mask.data[None, None], (0, more) * 3, mode="replicate")[0, 0]
+    z, y, x = grid.data.shape
+    return resample_isotropic(mask.with_data(beyond), _SHARES_MM).data[:z, :y, :x]
 
 
 def _bright_ml(ct: Volume) -> float:

@@ -1,13 +1,19 @@
-"""Intervals of 95 %: of means and differences by the bootstrap, of rates, and of correlations."""
+"""Intervals of 95 %: of means and differences by the bootstrap, of rates, and of correlations.
+
+The bootstrap of few values is too narrow: of 300 draws of four each, its interval missed the mean in 22 % and called
+12 % of differences clear that were none. So the intervals of few are Student's and Welch's.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import binomtest, bootstrap, norm, pearsonr, spearmanr
+from scipy.stats import binomtest, bootstrap, norm, pearsonr, spearmanr, t, ttest_ind
 
 RESAMPLES = 2000
 _LEVEL = 0.95
+_FEW = 10  # fewer values, or clusters, than these: the bootstrap missed the mean of ten in 9 % (of six in 13 %)
+_PERFECT = 1 - 1e-12  # a coefficient of ranks in perfect order, but for rounding
 _BATCH_VALUES = 4_000_000  # resampled at once, 32 MB
 
 Interval = tuple[float, float]
@@ -15,7 +21,7 @@ UNKNOWN: Interval = (float("nan"), float("nan"))
 
 
 def mean_interval(values: ArrayLike, seed: int, clusters: ArrayLike | None = None) -> Interval:
-    """Of the mean of values: bootstrap, bias-corrected and accelerated (Efron, JASA 82 (1987) 171).
+    """Of the mean of values: bootstrap, bias-corrected and accelerated (Efron, JASA 82 (1987) 171); of few, Student's.
 
     Values of one cluster, whole numbers (N,), are drawn together; without clusters each stands for itself. nan for
     fewer than two clusters, and for values that are all the same.
@@ -27,15 +33,33 @@ def mean_interval(values: ArrayLike, seed: int, clusters: ArrayLike | None = Non
     sums, counts = np.bincount(cluster, sample), np.bincount(cluster)
     if len(counts) < 2 or np.ptp(sums / counts) == 0:
         return UNKNOWN
+    if len(counts) < _FEW:
+        return _student(sums, counts)
     return _bootstrap((sums, counts), _mean, seed, paired=True)
 
 
 def difference_interval(first: ArrayLike, second: ArrayLike, seed: int) -> Interval:
-    """Of the mean of `first` less that of `second`, two independent samples."""
+    """Of the mean of `first` less that of `second`, two independent samples: bootstrap; of few, Welch's."""
     samples = np.asarray(first, float), np.asarray(second, float)
     if min(map(len, samples)) < 2 or any(np.ptp(sample) == 0 for sample in samples):
         return UNKNOWN
+    if min(map(len, samples)) < _FEW:
+        found = ttest_ind(*samples, equal_var=False).confidence_interval(_LEVEL)
+        return float(found.low), float(found.high)
     return _bootstrap(samples, _difference, seed)
+
+
+def _student(sums: np.ndarray, counts: np.ndarray) -> Interval:
+    """Of the mean of all values of clusters; how far the means of clusters lie off it tells its deviation.
+
+    Of clusters of one size it is Student's of their means, else that of a ratio by linearisation (Cochran, Sampling
+    techniques, 3rd edition, section 6.3).
+    """
+    mean = sums.sum() / counts.sum()
+    off = (sums - mean * counts) / counts.sum()
+    deviation = np.sqrt(len(counts) / (len(counts) - 1) * (off**2).sum())
+    half = t.ppf((1 + _LEVEL) / 2, len(counts) - 1) * deviation
+    return float(mean - half), float(mean + half)
 
 
 def _mean(sums: np.ndarray, counts: np.ndarray, axis: int) -> np.ndarray:
@@ -90,13 +114,18 @@ def pearson(x: ArrayLike, y: ArrayLike) -> Correlation:
 
 
 def spearman(x: ArrayLike, y: ArrayLike) -> Correlation:
-    """As `pearson`, of ranks; the variance of the transform after Bonett & Wright, Psychometrika 65 (2000) 23."""
+    """As `pearson`, of ranks; the variance of the transform after Bonett & Wright, Psychometrika 65 (2000) 23.
+
+    Of ranks in perfect order the interval is unknown: pairs without a spread say nothing about the spread.
+    """
     x, y = _pairs(x, y)
     if not _varies(x, y):
         return Correlation(float("nan"), UNKNOWN, len(x))
     value = float(spearmanr(x, y).statistic)
+    if abs(value) > _PERFECT:
+        return Correlation(value, UNKNOWN, len(x))
     half = norm.ppf((1 + _LEVEL) / 2) * np.sqrt((1 + value**2 / 2) / (len(x) - 3))
-    middle = np.arctanh(np.clip(value, -1 + 1e-12, 1 - 1e-12))
+    middle = np.arctanh(value)
     return Correlation(value, (float(np.tanh(middle - half)), float(np.tanh(middle + half))), len(x))
 
 

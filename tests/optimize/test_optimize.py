@@ -1,7 +1,10 @@
 """Every optimiser on problems of known minimum; seeds; reasons to stop."""
 
 import math
+import time
+from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -51,6 +54,24 @@ def test_result_is_the_best_point_met_and_the_trace_falls(settings: Optimiser) -
     assert result.value == min(met) == result.trace[-1][1]
     assert result.evaluations == len(met)
     assert [value for _, value, _ in result.trace] == sorted((value for _, value, _ in result.trace), reverse=True)
+
+
+def test_searches_side_by_side_are_those_one_after_the_other() -> None:
+    """Views are searched in threads; and who calls keeps NumPy's own generator as it was."""
+    settings = CmaEs(population=12, max_evaluations=300)
+
+    def slowly(deltas: Tensor) -> Tensor:
+        time.sleep(1e-3)  # lets the other thread draw its numbers
+        return bowl(deltas)
+
+    np.random.seed(5)  # noqa: NPY002
+    expected = np.random.random()  # noqa: NPY002
+    np.random.seed(5)  # noqa: NPY002
+    alone = [settings.minimise(slowly, 6, seed).delta for seed in (0, 1)]
+    with ThreadPoolExecutor(2) as pool:
+        together = [found.delta for found in pool.map(lambda seed: settings.minimise(slowly, 6, seed), (0, 1))]
+    assert all(torch.equal(*pair) for pair in zip(alone, together, strict=True))
+    assert np.random.random() == expected  # noqa: NPY002
 
 
 def test_same_seed_same_bits_other_seed_another_path() -> None:

@@ -12,6 +12,7 @@ from femoreg_torch.geometry import invert_rigid, rigid
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, load_plan, run_plan
 from femoreg_torch.registration.covariance import pose_covariance
+from femoreg_torch.registration.doubts import doubts_about_the_views
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.stage import run_stage
@@ -153,3 +154,10 @@ def test_the_rigid_preset_finds_every_object_from_a_start_pose(given: bool) -> N
         assert mm < (0.6 if given else 2.5), name
         assert deg < 1.0, name
     assert len(found.skipped) == (2 if given else 0)
+
+
+def test_views_are_found_by_a_tool_that_the_first_kind_of_images_lacks(scene: Scene) -> None:
+    """Images without the tool come first, and show nothing that is registered."""
+    alone = replace(scene, objects={"device": scene.objects["device"]})
+    poses = replace(TRUTH, camera1_from={"device": TRUTH.camera1_from["device"]})
+    assert doubts_about_the_views(alone, poses) == ()

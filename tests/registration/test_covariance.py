@@ -122,3 +122,14 @@ def test_bones_seen_twice_by_the_same_image_are_known_no_better() -> None:
     again = replace(scene, objects=twice, images={"anatomy": images, "again": images})
     first, second = (pose_covariance(each, truth, _LEVEL, _SIMILARITY) for each in (once, again))
     torch.testing.assert_close(second.images, first.images)
+
+
+def test_one_image_of_one_tile_has_a_covariance() -> None:
+    """A small detector: that nothing is known of its spread is no division by zero."""
+    truth = true_poses()
+    scene = make_scene(truth)
+    alone = replace(scene, objects={"pelvis": scene.objects["pelvis"]}, images={"anatomy": scene.images["anatomy"][:1]})
+    poses = Poses(truth.camera_from_camera1[:1], {"pelvis": truth.camera1_from["pelvis"]})
+    coarse = Level(pixel_mm=6.0, step_mm=4.0)  # 44 pixels: one tile of patches of radius 5
+    found = pose_covariance(alone, poses, coarse, GradNcc(patch_radius=5))
+    assert torch.isfinite(found.matrix).all()

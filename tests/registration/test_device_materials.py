@@ -232,6 +232,15 @@ def test_a_device_that_is_seen_through_tells_no_scatter() -> None:
     assert fit.scatter is None
 
 
+def test_images_before_the_device_that_show_no_object_do_as_well(mixed: Scene) -> None:
+    """A tool over whatever lies there: nothing is known of that, and the images without the tool hold it."""
+    alone = replace(mixed, objects={"device": mixed.objects["device"]})
+    found, _ = Calibration("materials").calibrate(
+        alone, replace(poses(), camera1_from={"device": poses().camera1_from["device"]})
+    )
+    assert float(found.objects["device"].volume.data.max()) > 0.4
+
+
 def test_without_images_of_the_device_there_is_nothing_to_do(mixed: Scene) -> None:
     alone = replace(mixed, images={"anatomy": mixed.images["anatomy"]})
     assert "no device" in (Calibration("materials").left_out(alone, poses()) or "")

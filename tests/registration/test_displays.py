@@ -64,6 +64,20 @@ def binned(raw: torch.Tensor, factor: int) -> torch.Tensor:
     return raw.reshape(rows // factor, factor, columns // factor, factor).sum((1, 3)) // factor**2
 
 
+@pytest.mark.parametrize("display", DISPLAYS[1:], ids=str)
+def test_pixels_of_the_c_arm_are_those_of_view_1_whoever_tells_its_display(tmp_path: Path, display: Display) -> None:
+    """What stands in the view is not another thing than what stands on top."""
+    write_image(tmp_path / "image.tif", display.to_stored(RAW).to(torch.uint16))
+    case = case_of(tmp_path, display, "image.tif")
+    in_view = replace(case, display=Display(), views=(replace(case.views[0], display=display),))
+    other = tmp_path / "in_view"
+    other.mkdir()
+    write_case(other, in_view)
+    again = read_case(other)
+    assert again.display_of(0) == display
+    assert again.carm == case.carm
+
+
 def case_of(folder: Path, display: Display, image: str, camera: Camera = CAMERA, **told: object) -> Case:
     """The case as it comes back from its folder."""
     trimesh.creation.box((20, 20, 20)).export(folder / "block.stl")

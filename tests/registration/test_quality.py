@@ -16,7 +16,7 @@ from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.quality import Limits, _Judged, _reason, _unsettled, _unturned, assess
+from femoreg_torch.registration.quality import Limits, _Judged, _reason, _unsettled, _unturned, _vague, assess
 from femoreg_torch.registration.run import _started_at
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.registration.turns import loss_by_turning
@@ -121,6 +121,16 @@ def test_a_pull_is_asked_beside_the_anchor_and_of_the_anchor_mostly_across(
     told = _unsettled("femur", judged, Limits())
     assert (told is None) is settled
     assert told is None or ("beside the pelvis" in told) is (beside is not None)
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_a_deviation_that_is_nan_counts_as_open(place: int) -> None:
+    """Wherever it stands: the largest of (0.1, nan, 0.2) is 0.2 to Python."""
+    good, bad = [0.1, 0.2, 0.1], [0.1, 0.2, 0.1]
+    bad[place] = math.nan
+    assert _vague("femur", good, good, Limits()) is None
+    assert "femur" in (_vague("femur", good, bad, Limits()) or "")
+    assert "femur" in (_vague("femur", bad, good, Limits()) or "")
 
 
 def test_a_start_that_is_given_does_not_change_what_is_expected(scene: Scene) -> None:

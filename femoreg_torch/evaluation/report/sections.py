@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterable
 
 from femoreg_torch.case import ObjectQuality, Result
+from femoreg_torch.case.quality import largest
 from femoreg_torch.evaluation.colours import GUIDE, PATH, hexadecimal, object_colours
 from femoreg_torch.evaluation.report.parts import Material, Section, Table
 from femoreg_torch.evaluation.report.pictures import panels
@@ -148,12 +149,12 @@ _VIEW_COLUMNS = ("", "likeness", "without it", "pull mm")
 def _in_words(quality: ObjectQuality) -> Iterable[str]:
     """What was measured of one object, in sentences with units."""
     yield sentence(quality.reason or "no reason given")
-    mm = number(max(quality.translation_deviation_mm, default=math.nan), 2)
-    degrees = number(max(quality.rotation_deviation_deg, default=math.nan), 2)
+    mm = number(largest(quality.translation_deviation_mm), 2)
+    degrees = number(largest(quality.rotation_deviation_deg), 2)
     yield f"Known to ± {mm} mm and ± {degrees}°: standard deviations along and about the least certain axis."
     with_carm = quality.translation_deviation_with_carm_mm
     if with_carm != quality.translation_deviation_mm and all(map(math.isfinite, with_carm)):
-        mm, degrees = number(max(with_carm), 2), number(max(quality.rotation_deviation_with_carm_deg), 2)
+        mm, degrees = (number(largest(of), 2) for of in (with_carm, quality.rotation_deviation_with_carm_deg))
         yield (
             "That takes the C-arm's file at its word. With a source distance and principal points that nobody has "
             f"calibrated: ± {mm} mm and ± {degrees}°, all objects together."
