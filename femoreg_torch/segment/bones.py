@@ -87,7 +87,7 @@ def _averaged(mask: Volume, grid: Volume) -> Tensor:
     more = math.ceil(max(grid.spacing_mm) / min(mask.spacing_mm))
     beyond = F.pad(mask.data[None, None], (0, more) * 3, mode="replicate")[0, 0]
     z, y, x = grid.data.shape
-    return resample_isotropic(mask.with_data(beyond), _SHARES_MM).data[:z, :y, :x]
+    return resample_isotropic(Volume(beyond, mask.lps_from_index), _SHARES_MM).data[:z, :y, :x]
 
 
 def _bright_ml(ct: Volume) -> float:

@@ -11,7 +11,7 @@ from scipy import ndimage
 from femoreg_torch.errors import InputError
 from femoreg_torch.planning.calibration import Calibration, calibrate
 from femoreg_torch.planning.element import CORNERS
-from femoreg_torch.planning.femur import Femur, cut_out
+from femoreg_torch.planning.femur import Femur, Frame, cut_out
 from femoreg_torch.planning.laws import Material, bone_material
 from femoreg_torch.planning.loading import make_loading
 from femoreg_torch.planning.mesh import blocks
@@ -323,3 +323,19 @@ def test_settings_that_cannot_be_are_refused(tmp_path: Path, change: str, told: 
     (tmp_path / "mine.yaml").write_text(f"extends: default\n{change}\n", encoding="utf-8")
     with pytest.raises(InputError, match=told):
         load_planning(tmp_path / "mine.yaml")
+
+
+@pytest.mark.parametrize("slice_mm", [0.7, 2.0, 3.0])
+def test_depth_is_counted_from_half_way_between_voxels_along_thick_slices_too(slice_mm: float) -> None:
+    """A block whose faces lie half-way between voxels: on its middle line all depths are known."""
+    spacing = np.array([0.7, 0.7, slice_mm])
+    block = np.zeros((41, 41, 21), bool)
+    block[5:-5, 5:-5, 5:-5] = True
+    frame = Frame(np.zeros(3), 24.0, *(np.zeros(3),) * 4)
+    depth = Femur("left", np.zeros(block.shape, np.float32), block, np.diag([*spacing, 1.0]), (0, 0, 0), frame).depth()
+    for axis, size in enumerate(block.shape):
+        turned = np.moveaxis(depth, axis, 0)
+        line = turned[:, turned.shape[1] // 2, turned.shape[2] // 2]
+        below = (np.arange(size // 2 + 1) - 4.5) * spacing[axis]
+        near = below < 5 * 0.7  # nearer to this face than to any other
+        np.testing.assert_allclose(line[: size // 2 + 1][near], below[near], atol=1e-6)

@@ -11,11 +11,13 @@ from pelvis_scene import HEADS, pelvis_scene
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import transform_points
 from femoreg_torch.segment import Segmentation, segment_bones_without_network, without_network
+from femoreg_torch.segment.bones import _averaged
 from femoreg_torch.segment.refine import contact
 from femoreg_torch.segment.sheets import APART, BONE, OUTSIDE, Links, enclosure, minimum_cut, sheetness
 from femoreg_torch.segment.without_network import Head, femoral_heads
-from femoreg_torch.volume import Volume
+from femoreg_torch.volume import Volume, axis_aligned, resample_isotropic
 
 NUMBERS = {name: 1 + n for n, name in enumerate(HIP.bone_names)}
 
@@ -155,3 +157,18 @@ def test_a_head_in_no_socket_is_refused(
     )
     with pytest.raises(InputError, match=says):
         segment_bones_without_network(scene[0])
+
+
+def test_a_mask_is_averaged_where_it_lies_on_a_grid_of_another_extent() -> None:
+    """Voxels of 1.25 mm end 2.5 mm before those of 3 mm do; a ball at the far end must not be drawn out to it."""
+    ct = Volume(torch.zeros(249, 249, 249), axis_aligned((1.0, 1.0, 1.0), (0, 0, 0)))
+    grid, fine = resample_isotropic(ct, 3.0), resample_isotropic(ct, 1.25)
+    z, y, x = torch.meshgrid(*(torch.arange(n) * 1.25 + 0.125 for n in fine.data.shape), indexing="ij")
+    middle = torch.tensor([220.0, 215.0, 222.0])
+    ball = ((x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2 < 20**2).float()
+    share = _averaged(fine.with_data(ball), grid)
+    assert share.shape == grid.data.shape
+    index = torch.stack(torch.meshgrid(*(torch.arange(n) for n in share.shape), indexing="ij"), -1).flip(-1).double()
+    points = transform_points(grid.lps_from_index, index.reshape(-1, 3))
+    centroid = (share.reshape(-1, 1) * points).sum(0) / share.sum()
+    torch.testing.assert_close(centroid, middle.double(), atol=0.05, rtol=0)
