@@ -92,9 +92,8 @@ class Femur:
         Half of which edge follows from the direction it lies in; slices may be thicker than their pixels.
         """
         far, nearest = ndimage.distance_transform_edt(mask, sampling=self.spacing, return_indices=True)
-        own = np.indices(mask.shape, sparse=True)
-        steps = [(there - here) * edge for there, here, edge in zip(nearest, own, self.spacing, strict=True)]
-        halves = sum((step * edge) ** 2 for step, edge in zip(steps, self.spacing, strict=True)) ** 0.5 / 2
+        steps = (nearest - np.indices(mask.shape)) * self.spacing[:, None, None, None]
+        halves = np.linalg.norm(steps * self.spacing[:, None, None, None], axis=0) / 2
         return np.asarray(far - halves / np.maximum(far, np.finfo(float).tiny))
 
 

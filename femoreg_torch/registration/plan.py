@@ -13,10 +13,11 @@ from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.orbit import OrbitSearch
 from femoreg_torch.registration.stage import Stage
 from femoreg_torch.registration.step import Step
+from femoreg_torch.registration.turn_search import TurnSearch
 from femoreg_torch.settings import read_record
 from femoreg_torch.similarity import Similarity, read_similarity
 
-STEPS = {"stage": Stage, "orbit_search": OrbitSearch, "calibration": Calibration}
+STEPS = {"stage": Stage, "orbit_search": OrbitSearch, "calibration": Calibration, "turn_search": TurnSearch}
 _READERS = {Similarity: read_similarity, Optimiser: read_optimiser}  # of fields that say their `kind`
 
 

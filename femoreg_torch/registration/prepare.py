@@ -108,6 +108,7 @@ def prepare_scene(case: Case) -> Scene:
             thing.start,
             parts=volumes.parts,
             axis=axis,
+            guide=(thing.points["base"], thing.points["tip"]) if {"base", "tip"} <= set(thing.points) else None,
             materials_known=thing.model.materials_known,
             sharp=bool(thing.model.solids),
         )

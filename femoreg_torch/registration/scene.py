@@ -40,6 +40,7 @@ class RigidObject:
     # of a model, each of one material; on the grid of `volume`, which is their sum; a bone has none
     parts: tuple[Volume, ...] = ()
     axis: Axis | None = None  # of a model that is round, as it was told
+    guide: tuple[Tensor, Tensor] | None = None  # base and tip (3,), mm, of a tool
     materials_known: bool = False  # whether materials were named; the HU of a single solid may be a guess
     sharp: bool = False  # whether it is made of solids with surfaces, over which its voxels average
     hardening: float = 0.0  # of the beam in it, see `registration.imaging.hardened`
