@@ -8,7 +8,6 @@ from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.case import Case
-from femoreg_torch.drr import project
 from femoreg_torch.errors import in_mm
 from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.registration.besides import besides, rival
@@ -22,10 +21,6 @@ from femoreg_torch.volume import guide_end
 
 _CASTS_NO_SHADOW = 0.004  # 1/mm: a fifth of water
 _MOST_WITHOUT_SHADOW = 0.08  # share of a model's volume
-# Path through a device times its attenuation from which a pixel tells nothing more of it: 2 % of the light, which
-# scattered light outshines.
-_OPAQUE = 4.0
-_STEP_MM = 1.0
 _ENCLOSED_MM = 2.5  # half of the width of a gap that counts as within: a drill in its sleeve
 # Another place of a device, of the similarity that it adds where it was found, without its best view: of wires beside
 # another one 0.44 and 0.48; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
@@ -97,8 +92,7 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
             empty &= ~_within_others(thing.volume.data >= _CASTS_NO_SHADOW, width)
             where = empty.nonzero()
             points = transform_points(thing.volume.lps_from_index, where.flip(1).double().cpu())
-            through = _where_light_is_left(scene.where_unsaturated(), poses, name)
-            empty[where.unbind(1)] = in_view(through, poses, name, points).to(empty.device)
+            empty[where.unbind(1)] = in_view(scene.where_unsaturated(), poses, name, points).to(empty.device)
             share = float(empty.sum() / inside.sum())
         if share > _MOST_WITHOUT_SHADOW:
             found.append(
@@ -106,20 +100,6 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
                 "images, and not mirrored, and that its nominal pose is not far off (see the preset fast_wide_device)"
             )
     return tuple(found)
-
-
-def _where_light_is_left(scene: Scene, poses: Poses, name: str) -> Scene:
-    """The same with only those pixels exposed that an object, as it was estimated, does not make black."""
-    volume = scene.objects[name].volume
-
-    def left(kind: Kind, view: int) -> Tensor | None:
-        exposed = scene.field(kind, view)
-        if kind not in scene.objects[name].shown_in:
-            return exposed
-        path = project(volume, poses.camera_from(name)[view][None], scene.camera(poses, view), _STEP_MM)[0]
-        return path < _OPAQUE if exposed is None else exposed & (path < _OPAQUE)
-
-    return replace(scene, fields={kind: tuple(left(kind, v) for v in range(scene.views)) for kind in scene.images})
 
 
 def _within_others(solid: Tensor, width: int) -> Tensor:

@@ -56,7 +56,7 @@ class Limits:
     most_deviation_mm: float = 1.0  # standard deviation along any axis
     most_deviation_deg: float = 0.6  # and about any axis
     most_intrinsics_sigma: float = 3.0  # of the C-arm's file, between what it says and what the images fit
-    # Half of `TOLD`: right turns lost 0.0044 to 0.0076 in three cases of a foreign simulator, and were 0.3° off at most;
+    # Half of `TOLD`: right turns lost 0.0044 to 0.0076 in three foreign cases, and were 0.1° off at most;
     # those that no image told lost 0.0003 at most, and were up to 3° off.
     least_loss_by_turning: float = TOLD / 2
     rival_cost: float = 0.005  # another start of a stage that ended so little above the best,
