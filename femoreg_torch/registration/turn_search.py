@@ -86,18 +86,24 @@ class TurnSearch:
         deltas = torch.deg2rad(angles)[:, None] * axis
         found = costs(poses, about_guide)(deltas).mean(1)
         best = 1 + int(found[1:].argmin())
-        there = moved(poses, (about_guide,), deltas[best])
-        body = Body(
-            (name,), 0, reference_point_in_view(scene, there, name, 0), torch.tensor(_SCALE, dtype=torch.float64)
-        )
-        objective = stage_objective(costs(there, body), (body,), None)
-        refined = _OPTIMISER.minimise(objective, len(body.free), seed=0)
-        here, evaluations = float(found[0]), len(angles) + refined.evaluations
-        if refined.value < here - _LEAST_GAIN:
-            here, poses = refined.value, moved(there, (body,), refined.delta)
-            told = f"the {name} fits better turned by {float(angles[best]):.0f}° about its guide"
-        else:
-            told = f"no other turn of the {name} fits better"
+
+        def refined(at: Poses) -> tuple[float, Poses, int]:
+            """Cost and poses where the tool fits best near a place, and evaluations."""
+            body = Body(
+                (name,), 0, reference_point_in_view(scene, at, name, 0), at.camera_from_camera1.new_tensor(_SCALE)
+            )
+            fit = _OPTIMISER.minimise(stage_objective(costs(at, body), (body,), None), len(body.free), seed=0)
+            return fit.value, moved(at, (body,), fit.delta), fit.evaluations
+
+        cost, there, evaluations = refined(moved(poses, (about_guide,), deltas[best]))
+        here, told = float(found[0]), f"no other turn of the {name} fits better"
+        evaluations += len(angles)
+        if cost < here - _LEAST_GAIN:  # where it lies may not be settled, so it is refined likewise
+            here, poses, more = refined(poses)
+            evaluations += more
+            if cost < here - _LEAST_GAIN:
+                here, poses = cost, there
+                told = f"the {name} fits better turned by {float(angles[best]):.0f}° about its guide"
         seconds = time.perf_counter() - began
         return StageRecord(self.name, None, here, evaluations, seconds, told, poses, moving=(name,))
 
