@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from femoreg_torch.case import Case
 from femoreg_torch.errors import in_mm
@@ -21,6 +22,9 @@ from femoreg_torch.volume import guide_end
 
 _CASTS_NO_SHADOW = 0.004  # 1/mm: a fifth of water
 _MOST_WITHOUT_SHADOW = 0.08  # share of a model's volume
+# Shadow, the logarithm of how much less light there is with a device, below which an image shows none, and over how
+# many pixels it is averaged. Blocks of steel that leave scattered light alone cast one shadow whatever is in them.
+_NO_SHADOW, _AVERAGED_PX = 0.15, 5
 _ENCLOSED_MM = 2.5  # half of the width of a gap that counts as within: a drill in its sleeve
 # Another place of a device, of the similarity that it adds where it was found, without its best view: of wires beside
 # another one 0.44 and 0.48; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
@@ -92,7 +96,8 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
             empty &= ~_within_others(thing.volume.data >= _CASTS_NO_SHADOW, width)
             where = empty.nonzero()
             points = transform_points(thing.volume.lps_from_index, where.flip(1).double().cpu())
-            empty[where.unbind(1)] = in_view(scene.where_unsaturated(), poses, name, points).to(empty.device)
+            bright = _where_no_shadow_is(scene.where_unsaturated())
+            empty[where.unbind(1)] = in_view(bright, poses, name, points).to(empty.device)
             share = float(empty.sum() / inside.sum())
         if share > _MOST_WITHOUT_SHADOW:
             found.append(
@@ -100,6 +105,20 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
                 "images, and not mirrored, and that its nominal pose is not far off (see the preset fast_wide_device)"
             )
     return tuple(found)
+
+
+def _where_no_shadow_is(scene: Scene) -> Scene:
+    """The same with only those pixels exposed that have as much light as in the image without the device."""
+
+    def left(kind: Kind, view: int) -> Tensor | None:
+        exposed, first = scene.field(kind, view), scene.first_kind
+        if kind == first or not (scene.there([first], [view]) and scene.there([kind], [view])):
+            return exposed
+        shadow = scene.image(kind, view) - scene.image(first, view)
+        bright = avg_pool2d(shadow[None], _AVERAGED_PX, 1, _AVERAGED_PX // 2)[0] < _NO_SHADOW
+        return bright if exposed is None else exposed & bright
+
+    return replace(scene, fields={kind: tuple(left(kind, v) for v in range(scene.views)) for kind in scene.images})
 
 
 def _within_others(solid: Tensor, width: int) -> Tensor:

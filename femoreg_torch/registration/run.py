@@ -32,6 +32,7 @@ from femoreg_torch.registration.start import (
     start_by_landmarks,
     with_segmentations,
 )
+from femoreg_torch.registration.turn_search import turned_from_where_told
 from femoreg_torch.registration.workflow import Follow, Report, run_plan
 
 
@@ -159,7 +160,10 @@ def register_scene(
     told, scene = scene, outcome.scene
     covariance = final_covariance(scene, outcome.poses, plan.imaging)
     quality = assess(scene, outcome.poses, Limits(), plan.imaging, outcome.trace, covariance)
-    against = doubts(case, told, scene, outcome.poses, covariance, plan.imaging, Limits())
+    against = (
+        *turned_from_where_told(plan.steps, outcome.trace),
+        *doubts(case, told, scene, outcome.poses, covariance, plan.imaging, Limits()),
+    )
     done = time.perf_counter()
     points, directions = path_in_camera1(case, outcome.poses)
     displays = [case.display_of(view) for view in range(len(case.views))]

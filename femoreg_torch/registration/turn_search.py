@@ -1,19 +1,21 @@
 """Exhaustive search of a tool's turn about its guide, which a nominal pose may have wrong by any angle."""
 
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
 from femoreg_torch.case.trace import StageRecord
-from femoreg_torch.geometry import Poses, transform_points
+from femoreg_torch.geometry import Poses, rotation_angle, transform_points
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import ImageCosts, image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, Kind, Scene, moved, reference_point_in_view
-from femoreg_torch.registration.step import check_known, chosen_kinds, chosen_objects, lacking
+from femoreg_torch.registration.step import Step, check_known, chosen_kinds, chosen_objects, lacking
 from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import Similarity
 
@@ -115,3 +117,23 @@ def _guide(scene: Scene, poses: Poses, name: str) -> tuple[Body, Tensor]:
     base, tip = transform_points(poses.camera1_from[name], torch.stack(guide))
     turning = torch.tensor([1.0, 1, 1, 0, 0, 0], dtype=torch.float64)
     return Body((name,), 0, base, turning), (tip - base) / (tip - base).norm()
+
+
+def turned_from_where_told(steps: Sequence[Step], trace: Sequence[StageRecord]) -> tuple[str, ...]:
+    """Tools that a search found turned about their guide, in words: the nominal pose is wrong, or the model mirrored.
+
+    A handle that is its own mirror image fits as well turned round as mirrored, so that no image tells which it is.
+    """
+    searches = {step.name for step in steps if isinstance(step, TurnSearch)}
+    told = []
+    for before, record in pairwise(trace):
+        for name in record.moving if record.name in searches else ():
+            first, then = (each.poses.camera1_from[name][:3, :3] for each in (before, record))
+            deg = float(rotation_angle(first.T @ then)) * 180 / math.pi
+            if deg > _NEAR_DEG:
+                told.append(
+                    f"the {name} was found turned by {deg:.0f}° about its guide against its nominal pose: if that pose "
+                    "is right, the model is mirrored, or not the one in the images; if it fits there in the overlay, "
+                    "tell the pose found as the nominal one and register again"
+                )
+    return tuple(told)
