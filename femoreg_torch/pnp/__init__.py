@@ -2,6 +2,15 @@
 
 from femoreg_torch.pnp.likely import likely_pose
 from femoreg_torch.pnp.minimal import refined_pose, three_point_poses
-from femoreg_torch.pnp.solve import FRONT_TO_BACK, MINIMUM, PnpResult, solve_pnp
+from femoreg_torch.pnp.solve import FRONT_TO_BACK, MINIMUM, MIRRORED_ADVICE, PnpResult, solve_pnp
 
-__all__ = ["FRONT_TO_BACK", "MINIMUM", "PnpResult", "likely_pose", "refined_pose", "solve_pnp", "three_point_poses"]
+__all__ = [
+    "FRONT_TO_BACK",
+    "MINIMUM",
+    "MIRRORED_ADVICE",
+    "PnpResult",
+    "likely_pose",
+    "refined_pose",
+    "solve_pnp",
+    "three_point_poses",
+]

@@ -35,6 +35,7 @@ _MOST_MISFIT = 8.0  # of one point, an outlier: that of 4 standard deviations
 _ROTATION_DEG = 10.0  # greatest standard deviation, over all axes, of a pose that is given
 _STEPS = (0.01, 0.01, 0.01, 1, 1, 10)  # typical sizes of a twist, rad and mm
 _ADVICE = "Take a view that shows more of the object, or give landmarks placed by hand."
+MIRRORED_ADVICE = "Is the picture mirrored, or are left and right, or columns and rows, exchanged?"
 _TILT_DEG = 30.0  # prior standard deviation of the beam about the axis of the patient that it runs along, each way
 FRONT_TO_BACK = (0.0, 1.0, 0.0)  # a beam in LPS whose source stands in front of the patient
 
@@ -75,7 +76,8 @@ def solve_pnp(
     chance.
 
     Raises `InputError` "too few usable landmarks …" when fewer than four, or fewer than half of the points, agree, or
-    if by `deviations_px` the rotation is uncertain by more than 10°.
+    if by `deviations_px` the rotation is uncertain by more than 10°; "no usable pose …" when they agree on one alone
+    that has the points not between source and detector, or the beam entering from another side.
     """
     weights = torch.ones(len(points)) if weights is None else weights
     _check(points, pixels, weights, deviations_px)
@@ -96,10 +98,15 @@ def solve_pnp(
         spread = _spread_px(pose.numpy(), object_points, deviations_px, point_deviations_mm, camera)
         pose, covariance = _most_probable(pose, object_points, image_points, spread, camera, along)
         inliers = _distances(pose, points, pixels, camera) < limit_px
-    if pose is None or not _enough(inliers) or not _plausible(pose.numpy(), object_points, camera, along):
+    if pose is None or not _enough(inliers):
         raise InputError(
             f"too few usable landmarks: {int(inliers.sum())} of {len(points)} agree on a pose, but at least {MINIMUM} "
             f"and half of them must. {_ADVICE}"
+        )
+    if not _plausible(pose.numpy(), object_points, camera, along):
+        raise InputError(
+            f"no usable pose: {int(inliers.sum())} of {len(points)} landmarks agree on one, but by it "
+            f"{_why_not(pose.numpy(), object_points, camera, along)}. {MIRRORED_ADVICE}"
         )
     distances = _distances(pose, points, pixels, camera)
     misfit = float("nan")
@@ -163,6 +170,17 @@ def _plausible(camera_from_object: Array, points: Array, camera: Camera, beam: A
     nearest, furthest = (share * camera.sdd_mm for share in _MIDDLE_DEPTHS)
     between = depth.min() > low and depth.max() < high and nearest < depth.mean() < furthest
     return bool(between and camera_from_object[2, :3] @ beam > 0)
+
+
+def _why_not(camera_from_object: Array, points: Array, camera: Camera, beam: Array) -> str:
+    """In words, why a pose is not plausible."""
+    depth = points @ camera_from_object[2, :3] + camera_from_object[2, 3]
+    if camera_from_object[2, :3] @ beam <= 0:
+        return "the beam enters the patient from the other side than `display` says"
+    return (
+        f"they lie {depth.min():.0f} to {depth.max():.0f} mm from the source, and the detector {camera.sdd_mm:.0f} mm, "
+        "where no patient fits"
+    )
 
 
 def _consensus(

@@ -13,7 +13,8 @@ from femoreg_torch.detect import Detection, as_stored, filled, within_field
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display, nearest_source
 from femoreg_torch.geometry import Camera, transform_points
-from femoreg_torch.pnp import FRONT_TO_BACK, MINIMUM, PnpResult, likely_pose, solve_pnp
+from femoreg_torch.pnp import FRONT_TO_BACK, MINIMUM, MIRRORED_ADVICE, PnpResult, likely_pose, solve_pnp
+from femoreg_torch.registration.picked import check_before_detector, check_in_picture, meant_otherwise
 from femoreg_torch.registration.prepare import view_distortion
 from femoreg_torch.registration.scene import Outline, Scene, Segmentation
 from femoreg_torch.registration.silhouette import refine_by_silhouette
@@ -192,9 +193,10 @@ def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) ->
 
     Pixels are those of the image as it is stored.
 
-    Raises `InputError` if fewer than four have a name that the case knows, fewer than four agree, they leave the
-    rotation open by more than 5°, they tell another side of the source than the case, or, in a view from a side, they
-    may be those of the other side.
+    Raises `InputError` if fewer than four have a name that the case knows, most lie beside the picture, fewer than four
+    agree, they leave the rotation open by more than 5°, they put the patient on or behind the detector, they tell
+    another side of the source than the case, or, in a view from a side, they may be those of the other side. Where they
+    would fit if they were meant otherwise (in mm, rows counted from below, …), the message says so.
     """
     names = [name for name in pixels if name in case.landmarks]
     if len(names) < MINIMUM:
@@ -204,25 +206,49 @@ def start_by_landmarks(case: Case, anchor: str, pixels: Mapping[str, Tensor]) ->
         )
     camera, display = case.carm.camera, case.display_of(0)
     picked, distortion = torch.stack([pixels[name] for name in names]).double(), view_distortion(case, 0)
-    seen = display.pixels_to_camera(picked if distortion is None else distortion.straight(picked), camera)
+    stored = display.stored_camera(camera)
+    check_in_picture(names, picked, stored)
     spread = {mark.name: mark.spread_mm for mark in case.anatomy.landmarks} if case.anatomy is not None else {}
 
-    def fitted(called: Sequence[str], rows: Sequence[int]) -> PnpResult:
-        """The pose by these rows (N,) of what was picked, if they are the landmarks of these names."""
+    def pose_of(called: Sequence[str], places: Tensor) -> PnpResult:
+        """The pose by places (N, 2) in the stored picture, if they are the landmarks of these names."""
+        seen = display.pixels_to_camera(places if distortion is None else distortion.straight(places), camera)
         return solve_pnp(
             torch.stack([case.landmarks[name] for name in called]).double(),
-            seen[list(rows)],
+            seen,
             camera,
             deviations_px=torch.full((len(called),), GIVEN_DEVIATION_MM / camera.mean_pixel_mm, dtype=torch.float64),
             point_deviations_mm=torch.tensor([spread.get(name, 0.0) for name in called], dtype=torch.float64),
             beam=display.beam,
         )
 
-    pnp = fitted(names, range(len(names)))
+    def fits(called: Sequence[str], places: Tensor) -> PnpResult | None:
+        try:
+            return pose_of(called, places) if set(called) <= set(case.landmarks) else None
+        except InputError:
+            return None
+
+    try:
+        pnp = pose_of(names, picked)
+    except InputError as error:
+        mirror = {} if case.anatomy is None else {mark.name: mark.mirror for mark in case.anatomy.landmarks}
+        otherwise = meant_otherwise(names, picked, stored, fits, mirror)
+        if otherwise is None:
+            raise
+        told = str(error).removesuffix(MIRRORED_ADVICE).rstrip()
+        raise InputError(f"landmarks in the image: {told} They fit {otherwise}.") from error
     _check_rotation(pnp)
+    check_before_detector(pnp, case.landmarks, names, picked, stored, fits)
     _check_beam(pnp.camera_from_object, display)
     if case.anatomy is not None:
-        _check_sides(pnp, case.anatomy, case.landmarks, names, fitted, _LOOK_AGAIN)
+        _check_sides(
+            pnp,
+            case.anatomy,
+            case.landmarks,
+            names,
+            lambda called, rows: pose_of(called, picked[list(rows)]),
+            _LOOK_AGAIN,
+        )
     marks = {
         name: LandmarkRecord(_pair(pixels[name]), 1.0, True, inlier)
         for name, inlier in zip(names, pnp.inliers.tolist(), strict=True)

@@ -7,7 +7,16 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import Camera, exp_so3, load_carm, log_so3, rotation_angle
+from femoreg_torch.geometry import (
+    Camera,
+    centred_camera,
+    exp_so3,
+    load_carm,
+    log_so3,
+    project_points,
+    rotation_angle,
+    transform_points,
+)
 from femoreg_torch.pnp import PnpResult, solve_pnp
 
 AP_FROM_LPS = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
@@ -136,8 +145,19 @@ def test_no_consensus() -> None:
 
 def test_a_patient_seen_from_behind_is_refused() -> None:
     behind = pose((0, 180, 0))
-    with pytest.raises(InputError, match="too few usable landmarks"):
+    with pytest.raises(InputError, match=r"too few usable landmarks|no usable pose"):
         solve_pnp(PELVIS, seen(behind), CAMERA)
+
+
+def test_landmarks_that_agree_on_an_impossible_pose_alone_are_not_called_too_few() -> None:
+    """Of a picture whose rows are counted from below; one is off, so that a pose of the right side is found first."""
+    camera = centred_camera(1020.0, (0.776, 0.776), (384, 384))
+    pixels = project_points(camera, transform_points(pose((8, 4, 0)), PELVIS))
+    pixels[:, 1] = 383 - pixels[:, 1]
+    with pytest.raises(
+        InputError, match=r"no usable pose: \d+ of 14 landmarks agree on one, but by it the beam enters"
+    ):
+        solve_pnp(PELVIS, pixels, camera, deviations_px=torch.full((14,), 1.9).double())
 
 
 def test_shapes_and_values_are_checked() -> None:

@@ -1,5 +1,6 @@
 """What a detection must offer to start a registration."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,7 +103,7 @@ def test_a_picture_that_shows_more_when_turned_is_asked_to_be(display: Display, 
 def test_a_view_that_shows_more_is_asked_to_be_the_first(display: Display) -> None:
     landmarks = dict(zip(NAMES[:6], torch.tensor(SIX, dtype=torch.float64), strict=True))
     found = detection(6, inverted=False)
-    found.pixels[:6] = project_points(CAMERA, transform_points(POSE, torch.stack(list(landmarks.values()))))
+    found.pixels[:6] = project_points(CAMERA, transform_points(CENTRED, torch.stack(list(landmarks.values()))))
     images = tuple(torch.rand(CAMERA.shape, generator=torch.Generator().manual_seed(seed)) for seed in (3, 4, 5))
     views = (
         View({"anatomy": Path("view1.tif")}, display=display),
@@ -135,7 +136,7 @@ def test_a_rotation_left_open_is_refused_where_no_outline_can_mend_it() -> None:
 
 
 def test_landmarks_picked_by_hand_place_the_first_object() -> None:
-    points = torch.tensor([*SIX, [-75.0, 15, -25], [-125, -75, -25]], dtype=torch.float64)
+    points = torch.tensor([*SIX, [-75.0, 15, -25], [-60, -75, -25]], dtype=torch.float64)
     names = [*NAMES[:6], "FH-x", "ASIS-x"]  # names of the user's own
     case = case_of(dict(zip(names, points, strict=True)))
     pixels = dict(zip(names, project_points(CAMERA, transform_points(POSE, points)), strict=True))
@@ -147,6 +148,79 @@ def test_landmarks_picked_by_hand_place_the_first_object() -> None:
     outlier = start_by_landmarks(case, "pelvis", wrong)
     assert [name for name, mark in outlier.landmarks.items() if not mark.used] == [names[0]]
     torch.testing.assert_close(outlier.camera1_from_object[:3, 3], POSE[:3, 3], atol=3.0, rtol=0)
+
+
+CENTRED = POSE - 0
+CENTRED[0, 3] = 0.0
+
+
+def picked(landmarks: dict[str, torch.Tensor]) -> torch.Tensor:
+    return project_points(CAMERA, transform_points(CENTRED, torch.stack(list(landmarks.values()))))
+
+
+def pelvis() -> dict[str, torch.Tensor]:
+    """A hip of the user's own with landmarks on both sides, LPS mm, seen from the front."""
+    left = {
+        "GSN": (60.0, 8, -70),
+        "IOF": (60, -18, -118),
+        "MOF": (45, 10, -118),
+        "SPS": (12, -18, -80),
+        "ASIS": (90, -60, -22),
+    }
+    sides = (("l", 1.0), ("r", -1.0))
+    return {
+        f"{name}-{end}": torch.tensor([sign * x, y, z], dtype=torch.float64)
+        for name, (x, y, z) in left.items()
+        for end, sign in sides
+    }
+
+
+def test_landmarks_beside_the_picture_were_not_picked_in_it() -> None:
+    case = case_of(pelvis())
+    right = dict(zip(case.landmarks, picked(pelvis()), strict=True))
+    start_by_landmarks(case, "pelvis", right)
+    with pytest.raises(InputError, match=r"GSN-l at \(-.* and 7 more lie outside the picture of 384 × 384 .* says RAS"):
+        start_by_landmarks(case, "pelvis", {name: -place for name, place in right.items()})
+    with pytest.raises(
+        InputError, match=r"lie outside the picture of 384 × 384 pixels. Are they of a picture of another"
+    ):
+        start_by_landmarks(case, "pelvis", {name: 4 * place for name, place in right.items()})
+    start_by_landmarks(case, "pelvis", right | {"MOF-r": torch.tensor([400.0, 40.0]).double()})  # an outlier
+
+
+@pytest.mark.parametrize("pixel_mm", [0.776, 0.388])
+def test_landmarks_in_mm_are_refused(pixel_mm: float) -> None:
+    """The patient seems to lie on the detector, or far behind it."""
+    camera = centred_camera(1020.0, (pixel_mm, pixel_mm), (round(298 / pixel_mm),) * 2)
+    case = replace(case_of(pelvis()), carm=replace(CARM, camera=camera))
+    far = CENTRED + torch.tensor([[0.0], [0], [40], [0]]) * torch.tensor([0.0, 0, 0, 1])
+    pixels = project_points(camera, transform_points(far, torch.stack(list(pelvis().values()))))
+    start_by_landmarks(case, "pelvis", dict(zip(pelvis(), pixels, strict=True)))
+    with pytest.raises(InputError, match=r"They fit in mm instead of pixels, as 3D Slicer shows them"):
+        start_by_landmarks(case, "pelvis", dict(zip(pelvis(), pixel_mm * pixels, strict=True)))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (
+            lambda name, place: (name, torch.stack([place[0], 383 - place[1]])),
+            "They fit with rows counted from below.$",
+        ),
+        (lambda name, place: (name, place.flip(0)), "They fit with column and row exchanged.$"),
+        (
+            lambda name, place: (name[:-1] + {"l": "r", "r": "l"}[name[-1]], place),
+            r"They fit with left and right exchanged \(-l and -r\), or in a picture that is mirrored.$",
+        ),
+    ],
+)
+def test_landmarks_that_fit_if_they_are_meant_otherwise(
+    wrong: Callable[[str, torch.Tensor], tuple[str, torch.Tensor]], says: str
+) -> None:
+    case = case_of(pelvis())
+    marks = dict(wrong(name, place) for name, place in zip(pelvis(), picked(pelvis()), strict=True))
+    with pytest.raises(InputError, match=says):
+        start_by_landmarks(case, "pelvis", marks)
 
 
 def test_too_few_landmarks_by_hand_are_refused() -> None:
