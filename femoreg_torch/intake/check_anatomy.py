@@ -88,6 +88,8 @@ def check_bones(
         found.warnings.append(seen.light)
     elif (misplaced := misplaced_labels(ct, bones.labels, list(bones.ids.values()))) is not None:
         found.warnings.append(misplaced)
+    elif seen.elsewhere is not None:
+        found.warnings.append(seen.elsewhere)
     found.facts.append(f"bones: {', '.join(bones.ids)}")
     names = [name for name, ids in segment_names(path).items() if not wanted & set(ids)] if has_names(path) else []
     if names:

@@ -141,7 +141,7 @@ def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]
     seen = densities(ct, bones.labels)
     if wrong := [*told, *filter(None, [seen.unscaled])]:
         raise InputError(f"{case.folder}: {'; '.join(wrong)}.")
-    return (*filter(None, [seen.light]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
+    return (*filter(None, [seen.light, seen.elsewhere]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
 
 
 def _check_path(case: Case, ct: Volume) -> None:

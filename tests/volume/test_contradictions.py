@@ -27,7 +27,7 @@ def ct_and_labels(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> tupl
 
 def unasked(ct: Volume, labels: Volume) -> bool:
     found = densities(ct, labels)
-    return found.unscaled is None and found.light is None
+    return found.unscaled is None and found.light is None and found.elsewhere is None
 
 
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 3.0), (3.0, 3.0, 3.0)])
@@ -39,6 +39,26 @@ def test_what_belongs_together_is_not_doubted(spacing: tuple[float, float, float
     assert unasked(bare, labels)
     assert misplaced_labels(bare, labels, IDS) is None
     assert shifted_labels(ct, labels) is shifted_labels(bare, labels) is None
+
+
+@pytest.mark.parametrize("axes", [(0, 1), (0, 2), (1, 2)], ids=str)
+def test_a_ct_that_is_turned_against_its_label_map_is_told(axes: tuple[int, ...]) -> None:
+    ct, labels = ct_and_labels()
+    told = densities(ct.with_data(ct.data.flip(axes)), labels).elsewhere
+    assert "is one of the two flipped or turned" in str(told)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.3])
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (3.0, 3.0, 3.0)])
+def test_sparse_bone_and_fatty_marrow_are_not_taken_for_another_ct(
+    factor: float, spacing: tuple[float, float, float]
+) -> None:
+    """Marrow that is no denser than the muscle beside it, or lighter, within a shell of little density."""
+    ct, labels = ct_and_labels(spacing)
+    for fat_hu in (80.0, 200.0):
+        marrow = (labels.data > 0) & (ct.data < 400)
+        sparse = torch.where(marrow, ct.data - fat_hu, ct.data)
+        assert unasked(ct.with_data(torch.where(sparse > 0, factor * sparse, sparse)), labels)
 
 
 def test_bones_of_foam_with_a_hard_shell_are_not_doubted() -> None:
