@@ -2,12 +2,12 @@
 
 import itertools
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from femoreg_torch.case import Case, femoroplasty_form
 from femoreg_torch.case.femoroplasty import ANATOMY_IMAGES, DEVICE, DEVICE_IMAGES
@@ -40,10 +40,16 @@ from femoreg_torch.fluoro import (
 )
 from femoreg_torch.fluoro.reading import LOOKS_LOG
 from femoreg_torch.geometry import Camera, CArm
+from femoreg_torch.intake.exchanged import kinds_exchanged, rough_attenuation, views_exchanged
 from femoreg_torch.intake.found import Found
 
-_LOOK_PX = 96  # images are compared at about so many pixels across
-_MORE_ALIKE = 0.2  # correlation by which another view's image must be more alike before it is told
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """An image that could be read, and its attenuation (up to a scale) if it is known which way its values run."""
+
+    values: Tensor  # (H, W)
+    attenuation: Tensor | None  # (H, W)
 
 
 def readable_views(top: Fields, folder: Path) -> list[View]:
@@ -73,7 +79,7 @@ def check_views(
         return {}
     if not views:
         found.problem(f"{top.where('views')}: empty. At least one fluoroscopic image is needed.")
-    read: dict[str, Tensor] = {}
+    read: dict[str, _Seen] = {}
     poses: dict[str, Tensor] = {}
     for view in views:
         found.unknown_keys(view, (ANATOMY_IMAGES, DEVICE_IMAGES, *VIEW_KEYS))
@@ -100,7 +106,7 @@ def check_views(
     for (one, first), (other, second) in itertools.combinations(poses.items(), 2):
         if torch.allclose(first, second, atol=1e-6):
             found.warnings.append(f"{one} and {other} are given one and the same pose of the C-arm")
-    _check_exchanged(_by_key(read), ANATOMY_IMAGES, found)
+    _check_exchanged(read, ANATOMY_IMAGES, found)
     if DEVICE in top and views and not any(DEVICE_IMAGES in view for view in views):
         found.warnings.append("no view has an image with the device, so it will not be found")
     return _by_key(read)
@@ -108,29 +114,38 @@ def check_views(
 
 def check_images(case: Case, found: Found) -> dict[str, Tensor]:
     """All images of a case that could be read. Returns those (H, W) that could be read themselves, by key."""
-    read: dict[str, Tensor] = {}
+    read: dict[str, _Seen] = {}
     for number, view in enumerate(case.views):
         shown = View({}, view.intensity, frames=view.frames, display=case.display_of(number))
         for kind, path in view.images.items():
             _check_image(path, shown, case.carm, f"{case.folder}/case.yaml, views[{number}].{kind}", read, found)
     _check_different(read, found)
     if case.views:
-        _check_exchanged(_by_key(read), next(iter(case.views[0].images)), found)
+        _check_exchanged(read, next(iter(case.views[0].images)), found)
     return _by_key(read)
 
 
-def _by_key(read: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {where.rpartition(", ")[2]: image for where, image in read.items()}
+def _by_key(read: Mapping[str, _Seen]) -> dict[str, Tensor]:
+    return {where.rpartition(", ")[2]: image.values for where, image in read.items()}
 
 
-def _check_image(path: Path, view: View, carm: CArm | None, where: str, read: dict[str, Tensor], found: Found) -> None:
+def _check_exchanged(read: Mapping[str, _Seen], first_kind: str, found: Found) -> None:
+    found.warnings += views_exchanged(_by_key(read), first_kind)
+    if first_kind == ANATOMY_IMAGES:
+        shown = {where.rpartition(", ")[2]: image.attenuation for where, image in read.items()}
+        found.warnings += kinds_exchanged(shown, ANATOMY_IMAGES, DEVICE_IMAGES)
+
+
+def _check_image(path: Path, view: View, carm: CArm | None, where: str, read: dict[str, _Seen], found: Found) -> None:
     """What is wrong with an image, as the registration would say; its values are put into `read`."""
     stored = found.attempt(lambda: read_stored(path, view.frames))
     if stored is None:
         return
-    read[where] = stored.values
     found.warnings += [f"{path.name} {remark}" for remark in stored.remarks]
     settled = found.attempt(lambda: settled_intensity(view.intensity, stored, f"{where}: {path.name}"))
+    read[where] = _Seen(
+        stored.values, None if settled is None else rough_attenuation(stored.values_as(settled), settled)
+    )
     if settled == "raw":
         found.attempt(lambda: check_intensity(stored.values, f"{where}: {path.name}"))
         if (dark := below_zero(stored.values, stored.padding)) is not None:
@@ -166,35 +181,7 @@ def _check_grid(grid: GridImage | None, camera: Camera, where: str) -> None:
         find_distortion(image, camera, grid.pitch_mm, where)
 
 
-def _check_different(images: Mapping[str, Tensor], found: Found) -> None:
+def _check_different(images: Mapping[str, _Seen], found: Found) -> None:
     for (one, first), (other, second) in itertools.combinations(images.items(), 2):
-        if torch.equal(first, second):
+        if torch.equal(first.values, second.values):
             found.problem(f"{other}: the same image as {one.rpartition(', ')[2]}. Give every exposure its own image.")
-
-
-def _check_exchanged(images: Mapping[str, Tensor], first_kind: str, found: Found) -> None:
-    """Warns of images that look less like the first one of their own view than like that of another view."""
-    looks = {key: _look(image) for key, image in images.items()}
-    firsts = {key.rpartition(".")[0]: look for key, look in looks.items() if key.endswith(f".{first_kind}")}
-    for key, look in looks.items():
-        view = key.rpartition(".")[0]
-        alike = {other: float((look * first).mean()) for other, first in firsts.items() if first.shape == look.shape}
-        if key == f"{view}.{first_kind}" or view not in alike:
-            continue
-        nearest = max(alike, key=lambda other: alike[other])
-        if alike[nearest] > alike[view] + _MORE_ALIKE:
-            found.warnings.append(
-                f"{key}: looks like {nearest}.{first_kind} (correlation {alike[nearest]:.2f}) and not like "
-                f"{view}.{first_kind} ({alike[view]:.2f}). Are images of two views exchanged? Both of a view are to be "
-                "of one C-arm pose."
-            )
-
-
-def _look(image: Tensor) -> Tensor:
-    """What is seen in an image (H, W), coarse, without slow changes of brightness: mean 0, mean square 1."""
-    factor = max(1, round(min(image.shape) / _LOOK_PX))
-    values = image.float() - image.min()
-    coarse = avg_pool2d(values[None, None], factor)
-    logs = (coarse + 0.01 * coarse.mean() + 1e-30).log()
-    detail = logs - avg_pool2d(logs, 11, stride=1, padding=5, count_include_pad=False)
-    return ((detail - detail.mean()) / detail.std().clamp_min(1e-30))[0, 0]

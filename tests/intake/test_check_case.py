@@ -417,6 +417,35 @@ def test_exchanged_images_are_told(files: Path, tmp_path: Path, order: tuple[int
     assert len(warnings) == told, warnings
 
 
+@pytest.mark.parametrize("intensity", ["raw", "log"])
+@pytest.mark.parametrize("exposure", [0.5, 1.0, 1.8])
+def test_images_with_and_without_the_device_that_are_exchanged_are_told(
+    files: Path, tmp_path: Path, intensity: str, exposure: float
+) -> None:
+    """Also where those with the device are exposed more or less; a part that moved between both is no device."""
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+
+    def told(names: tuple[str, str], moved: bool = False) -> list[str]:
+        for view in (1, 2, 3):
+            lumps = cv2.GaussianBlur(np.random.default_rng(view).normal(size=(48, 40)), (0, 0), 2)
+            attenuation = 1.2 + lumps / lumps.std() / 3
+            both = attenuation + 0.8 * (np.arange(40) // 3 == 5)
+            attenuation = attenuation + 0.8 * (np.arange(40) // 3 == 8) * moved
+            for name, depth in zip(names, (attenuation, both - np.log(exposure)), strict=True):
+                values = 20000 * np.exp(-depth) if intensity == "raw" else 5000 + 8000 * depth
+                cv2.imwrite(str(folder / f"view{view}{name}.png"), values.clip(0, 65535).astype(np.uint16))
+        content = case_content()
+        content["views"] = [view | {"intensity": intensity} for view in content["views"]]
+        write_content(folder, content)
+        return [each for each in check_case(folder, find_start=False).warnings if "exchanged?" in each]
+
+    assert told(("", "_device")) == []
+    assert told(("", "_device"), moved=True) == []
+    (line,) = told(("_device", ""))
+    assert line.startswith("views[0], views[1], views[2]: `anatomy` shows something dense that `device` lacks")
+
+
 def test_few_landmarks_are_a_warning(files: Path, tmp_path: Path) -> None:
     folder = tmp_path / "case"
     shutil.copytree(files, folder)
