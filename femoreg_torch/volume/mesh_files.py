@@ -21,18 +21,19 @@ if TYPE_CHECKING:
 _SUFFIXES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb")
 _MOST_UNZIPPED = 2**29  # bytes of all that a 3MF file holds
 _SHORTEST_MM, _LONGEST_MM = 5.0, 2000.0  # of a device; beyond them the file is likely in metres, inches or µm
+_SAME_DECIMALS = 4  # of corners in mm
 _FARTHEST_MM = 1e6  # of a corner from the origin
 
 
 def read_mesh(path: Path) -> "trimesh.Trimesh":
     """A closed surface in mm from an STL, PLY, OBJ, OFF, 3MF or GLB file, equal vertices merged.
 
-    Bodies of a file that holds several are taken together. Raises `InputError`.
+    Bodies of a file that holds several are taken together, one that stands there twice once. Raises `InputError`.
     """
     import trimesh
 
     bodies = _load(Path(path), split_objects=False, split_groups=False)
-    whole = trimesh.util.concatenate(list(bodies.values()))
+    whole = trimesh.util.concatenate(_each_once(list(bodies.values())))
     assert isinstance(whole, trimesh.Trimesh)  # as all bodies are
     return check_closed(whole, str(path))
 
@@ -56,6 +57,21 @@ def read_bodies(path: Path, names: Sequence[str]) -> "dict[str, trimesh.Trimesh]
             f"{path}: {' and '.join(wrong)}. Name each body once under `parts`; the file has: {', '.join(bodies)}."
         )
     return {name: check_closed(bodies[name], f"{path}, body {name}") for name in names}
+
+
+def _each_once(bodies: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
+    """The bodies without those whose triangles are all those of an earlier one.
+
+    `check_closed` sees to bodies within one mesh, where equal corners have one number; those of a 3MF, a GLB or an STL
+    of several solids have numbers of their own each, and where they overlap voxels on the surface would count twice.
+    """
+    found: dict[bytes, trimesh.Trimesh] = {}
+    for body in bodies:
+        corners = np.round(body.triangles, _SAME_DECIMALS) + 0.0  # no −0
+        lowest = np.lexsort(corners.transpose(2, 0, 1)[::-1])[:, 0]
+        turned = np.take_along_axis(corners, ((lowest[:, None] + np.arange(3)) % 3)[..., None], 1).reshape(-1, 9)
+        found.setdefault(turned[np.lexsort(turned.T[::-1])].tobytes(), body)
+    return list(found.values())
 
 
 def bounds_of(meshes: "Sequence[trimesh.Trimesh]", where: str) -> np.ndarray:

@@ -111,6 +111,25 @@ def test_a_body_that_stands_twice_in_a_file_is_left_once(tmp_path: Path) -> None
     assert read_mesh(tmp_path / "device.stl").volume == pytest.approx(8000 + 729)
 
 
+@pytest.mark.parametrize("suffix", [".3mf", ".glb", ".stl"])
+def test_a_body_that_stands_twice_under_two_names_is_left_once(tmp_path: Path, suffix: str) -> None:
+    """Its triangles may come in another order, and begin with another corner. A third one lies elsewhere."""
+    bodies = {"a": _block(20, (0, 0, 0)), "b": _block(20, (0, 0, 0)), "c": _block(20, (7, 0, 0))}
+    bodies["b"].faces = np.roll(bodies["b"].faces[::-1], 1, 1)
+    path = tmp_path / f"device{suffix}"
+    if suffix == ".stl":
+        texts = (trimesh.exchange.stl.export_stl_ascii(body) for body in bodies.values())
+        path.write_text("\n".join(texts), encoding="utf-8")
+    else:
+        scene = trimesh.Scene()
+        for name, body in bodies.items():
+            body = body.copy().apply_scale(1e-3) if suffix == ".glb" else body
+            scene.add_geometry(body, node_name=name, geom_name=name)
+        scene.units = "m" if suffix == ".glb" else "mm"
+        scene.export(path)
+    assert read_mesh(path).volume == pytest.approx(2 * 8000, rel=1e-4)
+
+
 def test_a_wall_that_two_nested_bodies_share_is_kept() -> None:
     outer, inner = _block(20, (0, 0, 0)), _block(20, (0, 0, 0))
     inner.vertices[inner.vertices[:, 0] > 0, 0] = 4.0  # five of its walls lie in the other's, one of them alike
