@@ -1,6 +1,7 @@
 """What a file or folder holds, in words and as a picture: `femoreg inspect`."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,7 +78,7 @@ def inspect_path(path: Path, series: str | None = None) -> Findings:
     name = path.name.lower()
     kinds: tuple[tuple[tuple[str, ...], Callable[[Path], Findings]], ...] = (
         ((SEGMENTATION_SUFFIX,), _segmentation),
-        (_VOLUMES, _volume),
+        (_VOLUMES, _volume_or_slice),
         (_POINTS, _points),
         (_MESHES, _mesh),
         (_TRANSFORMS, _transform),
@@ -198,6 +199,16 @@ def _of_dicom(path: Path) -> Findings:
     if several:
         words.append("shown: the first frame; a case says which are meant, as `frames: 1` or `frames: mean`")
     return Findings("DICOM image", (*found.facts, *words), found.warnings, found.picture)
+
+
+def _volume_or_slice(path: Path) -> Findings:
+    """A volume, or a fluoroscopic image in a file of its kind."""
+    try:
+        return _volume(path)
+    except InputError:
+        with suppress(InputError):
+            return _image(path)
+        raise
 
 
 def _volume(path: Path, series: str | None = None) -> Findings:

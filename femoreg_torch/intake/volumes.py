@@ -11,6 +11,8 @@ import torch
 from femoreg_torch.arrays import opened
 from femoreg_torch.volume import Volume
 from femoreg_torch.volume.borders import touched_faces
+from femoreg_torch.volume.nifti import NIFTI_SUFFIXES
+from femoreg_torch.volume.text_headers import META_SUFFIXES, NRRD_SUFFIXES
 
 _COARSE_MM, _COARSE_STEP_MM = 1.5, 3.0  # the registration takes voxels of 1 mm
 _SOFT_HU, _BONE_HU, _METAL_HU = -50.0, 300.0, 2800.0
@@ -19,7 +21,10 @@ _METAL_ML = 1.0
 _SPACES_WITHOUT_A_PATIENT = tuple(
     name + time for name in (b"scanner-xyz", b"3d-right-handed", b"3d-left-handed") for time in (b"", b"-time")
 )  # NRRD format, section 5.1
-_NRRD_HEADER = 2**16  # bytes that hold it
+_HEADER = 2**16  # bytes that hold that of an NRRD file or MetaImage
+_META_MATRIX = re.compile(rb"^(TransformMatrix|Rotation|Orientation)[ \t]*=", re.MULTILINE)
+_META_LETTERS = re.compile(rb"^AnatomicalOrientation[ \t]*=[ \t]*([A-Za-z]{3})[ \t\r]*$", re.MULTILINE)
+_LPS_BY_LETTERS = b"RAI"  # MetaImage names the sides that axes come from
 
 
 def described(volume: Volume) -> str:
@@ -68,10 +73,12 @@ def looks_like_labels(volume: Volume) -> bool:
 
 
 def header_warnings(path: Path) -> list[str]:
-    """In words, where a NIfTI or NRRD header leaves open where the patient's left is, or contradicts itself."""
-    if path.name.lower().endswith((".nrrd", ".nhdr")):
+    """In words, where the header of a volume leaves open where the patient's left is, or contradicts itself."""
+    if path.name.lower().endswith(META_SUFFIXES):
+        return _of_meta_image(path)
+    if path.name.lower().endswith(NRRD_SUFFIXES):
         with opened(path) as file:
-            header = file.read(_NRRD_HEADER).partition(b"\n\n")[0]
+            header = file.read(_HEADER).partition(b"\n\n")[0]
         told = re.search(rb"^space:[ \t]*(.*?)[ \t\r]*$", header, re.MULTILINE | re.IGNORECASE)
         if told is None:
             return ["the NRRD header names no `space`: its axes are assumed to run to the left, back and head"]
@@ -81,7 +88,7 @@ def header_warnings(path: Path) -> list[str]:
                 "assumed to run to the left, back and head"
             ]
         return []
-    if not path.name.lower().endswith((".nii", ".nii.gz")):
+    if not path.name.lower().endswith(NIFTI_SUFFIXES):
         return []
     image: Any = nibabel.load(path)  # its declared type is that of all formats
     header = image.header
@@ -98,3 +105,17 @@ def header_warnings(path: Path) -> list[str]:
     except ValueError:  # a quaternion that is none
         return ["the qform of the NIfTI header is damaged, its sform was taken; other programs may take the first"]
     return []
+
+
+def _of_meta_image(path: Path) -> list[str]:
+    """ITK passes over AnatomicalOrientation, and without a matrix takes axes to run to the left, back and head."""
+    with opened(path) as file:
+        header = file.read(_HEADER).partition(b"ElementDataFile")[0]
+    letters = _META_LETTERS.search(header)
+    named = None if letters is None else letters[1].upper()
+    if _META_MATRIX.search(header) or named == _LPS_BY_LETTERS:
+        return []
+    said = "" if named is None else f", and its AnatomicalOrientation, {named.decode()}, is passed over"
+    return [
+        "the MetaImage header has no `TransformMatrix`: its axes are assumed to run to the left, back and head" + said
+    ]

@@ -169,6 +169,46 @@ def test_runs_in_time_and_headers_without_a_space(tmp_path: Path) -> None:
     assert any("`space` Scanner-XYZ, which says" in one for one in inspect_path(tmp_path / "loud.nrrd").warnings)
 
 
+@pytest.mark.parametrize("name", ["ct.nii", "ct.hdr"])
+def test_nifti_files_and_pairs_without_a_place_are_told(tmp_path: Path, name: str) -> None:
+    kind = nibabel.Nifti1Image if name.endswith(".nii") else nibabel.Nifti1Pair
+    image = kind(hu(), ras_affine())
+    image.set_sform(ras_affine(), 0)
+    image.set_qform(ras_affine(), 0)
+    nibabel.save(image, tmp_path / name)
+    assert any("neither sform nor qform" in one for one in inspect_path(tmp_path / name).warnings)
+
+
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        ("", "has no `TransformMatrix`: its axes are assumed to run to the left, back and head"),
+        ("AnatomicalOrientation = LPI\n", "and its AnatomicalOrientation, LPI, is passed over"),
+        ("AnatomicalOrientation = RAI\n", None),
+        ("TransformMatrix = 1 0 0 0 1 0 0 0 1\n", None),
+    ],
+)
+def test_a_meta_image_without_a_matrix_is_told(tmp_path: Path, lines: str, told: str | None) -> None:
+    size = " ".join(map(str, SIZE))
+    header = f"ObjectType = Image\nNDims = 3\nBinaryData = True\n{lines}ElementSpacing = 4 4 4\nDimSize = {size}\n"
+    content = ROWS_FIRST.astype("<i2").tobytes()
+    (tmp_path / "ct.mha").write_bytes(
+        (header + "ElementType = MET_SHORT\nElementDataFile = LOCAL\n").encode() + content
+    )
+    warnings = [one for one in inspect_path(tmp_path / "ct.mha").warnings if "MetaImage" in one]
+    assert len(warnings) == (told is not None)
+    assert told is None or told in warnings[0]
+
+
+@pytest.mark.parametrize("name", ["view.mha", "view.nrrd", "view.nii.gz"])
+def test_images_of_one_slice_are_inspected_as_images(tmp_path: Path, name: str) -> None:
+    values = np.random.default_rng(0).integers(100, 9000, (1, 30, 40)).astype(np.uint16)
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(tmp_path / name))
+    found = inspect_path(tmp_path / name)
+    assert found.kind == "image"
+    assert found.facts[0].startswith("40 × 30 pixels")
+
+
 def test_label_maps_of_floats_and_with_names_in_the_header(tmp_path: Path, plain: Volume) -> None:
     values = label_values()
     expected = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 1, 0)))
