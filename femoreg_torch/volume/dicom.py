@@ -30,6 +30,7 @@ _KINDS_OF_PIXELS = (b"OB", b"OW", b"OF", b"OD", b"UN")  # value representations 
 _UNDEFINED = 0xFFFFFFFF  # length of compressed pixels
 _AIR_HU = -1024.0  # what lies outside the slices of a tilted gantry
 _NOT_DICOM = {".gz", ".nii", ".nrrd", ".mha", ".mhd", ".json", ".txt", ".png", ".jpg", ".tif", ".tiff", ".zip", ".stl"}
+_MOST_LISTED = 12  # series in a message
 _SAME_PLACE_MM = 0.01  # slices that are closer are one
 _SHEAR_MM = 0.3  # of the last slice against the first: what rounding of positions and axes may make of it
 
@@ -41,6 +42,10 @@ class Slice:
     path: Path
     header: Any  # pydicom.Dataset with some of `_TAGS`
     holds_pixels: bool  # as many bytes of them as it claims
+
+    @property
+    def is_scout(self) -> bool:
+        return "LOCALIZER" in [str(word).upper() for word in self.header.get("ImageType") or []]
 
     def numbers(self, name: str, count: int) -> NDArray[np.float64] | None:
         """The numbers of a tag, or None where it is missing or holds something else."""
@@ -90,10 +95,9 @@ class Series:
         Of a series that tells no modality, as some anonymisers leave it, slices with a place in the patient are taken.
         """
         first = self.slices[0]
-        scout = "LOCALIZER" in [str(word).upper() for word in first.header.get("ImageType") or []]
         frames = first.whole("NumberOfFrames", 1)
         meant = self.modality.upper() in _VOLUMES or (not self.modality and "ImagePositionPatient" in first.header)
-        return meant and not scout and (len(self.slices) > 1 or frames > 1)
+        return meant and not first.is_scout and (len(self.slices) > 1 or frames > 1)
 
 
 def is_dicom(path: Path) -> bool:
@@ -110,7 +114,7 @@ def series_in(folder: Path) -> list[Series]:
     """All DICOM series in a folder and in the folders inside it, in order of their numbers.
 
     A file that stands there twice, by its SOP Instance UID and its place, counts once. Images without a Series Instance
-    UID are taken for one series.
+    UID are taken for one series. A scout that bears the UID of the volume it was taken for is no part of it.
     """
     found: dict[str, dict[str, Slice]] = {}
     for one in _headers(folder):
@@ -119,11 +123,12 @@ def series_in(folder: Path) -> list[Series]:
             name = one.header.get("SOPInstanceUID") or one.path
             found.setdefault(uid, {}).setdefault(f"{name} {one.header.get('ImagePositionPatient')}", one)
     series = []
-    for uid, slices in found.items():
-        first = next(iter(slices.values())).header
+    for uid, files in found.items():
+        slices = [one for one in files.values() if not one.is_scout] or list(files.values())
+        first = slices[0].header
         words = (str(first.get(tag) or "").strip() for tag in ("SeriesNumber", "SeriesDescription", "Modality"))
         number, description, modality = words
-        series.append(Series(uid, tuple(slices.values()), number, description, modality))
+        series.append(Series(uid, tuple(slices), number, description, modality))
     return sorted(series, key=lambda one: (not one.number.isdecimal(), one.number.zfill(9), one.uid))
 
 
@@ -194,7 +199,7 @@ def choose_series(path: Path, wanted: str | None = None) -> Series:
         chosen = [one for one in there if one.may_be_volume]
     if len(chosen) == 1:
         return chosen[0]
-    alone = not chosen and len(there) > 2 and all(one.modality == "CT" and len(one.slices) == 1 for one in there)
+    alone = not chosen and len(there) > 2 and all(one.modality in _VOLUMES and len(one.slices) == 1 for one in there)
     if alone and wanted is None:
         raise InputError(
             f"{folder}: each of its {len(there)} DICOM files has a SeriesInstanceUID of its own, so they make no "
@@ -216,7 +221,9 @@ def _listed(series: Sequence[Series]) -> str:
     """The series in a few words each; with the UIDs of those that nothing else tells apart."""
     names = [(one.number, one.description) for one in series]
     alone = [any(name) and names.count(name) == 1 for name in names]
-    return ", ".join(one.told if known else f"{one.told} {one.uid}" for one, known in zip(series, alone, strict=True))
+    told = [one.told if known else f"{one.told} {one.uid}" for one, known in zip(series, alone, strict=True)]
+    more = f" and {len(told) - _MOST_LISTED} more" if len(told) > _MOST_LISTED else ""
+    return ", ".join(told[:_MOST_LISTED]) + more
 
 
 def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:

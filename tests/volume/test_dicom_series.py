@@ -399,9 +399,31 @@ def test_what_anonymisers_leave_of_a_series_is_read(tmp_path: Path, kind: str) -
         assert read_ct(folder / "IM0250").data.shape == SIZE
 
 
-def test_a_uid_for_each_slice_is_told_as_that(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["A_scout", "Z_scout"])
+def test_a_scout_with_the_uid_of_the_volume_is_no_slice_of_it(tmp_path: Path, name: str) -> None:
+    """Whether it comes first by name, or last."""
     folder = tmp_path / "ct"
-    for n, data in enumerate(write_series(folder)):
+    uid = write_series(folder)[0].SeriesInstanceUID
+    (scout,) = write_series(tmp_path / "scout", values=VALUES[:1, :4], ImageType=["ORIGINAL", "PRIMARY", "LOCALIZER"])
+    scout.SeriesInstanceUID = uid
+    scout.save_as(folder / name)
+    np.testing.assert_allclose(sampled(read_ct(folder), points_of(AXIAL, NO_LEAN)), VALUES - 1024)
+    assert [len(one.slices) for one in series_in(folder)] == [7]
+
+
+def test_of_many_series_few_are_listed(tmp_path: Path) -> None:
+    for n, data in enumerate(write_series(tmp_path / "ct", values=np.repeat(VALUES, 3, 0), Modality="CR")):
+        data.SeriesInstanceUID = generate_uid()
+        data.save_as(tmp_path / "ct" / f"IM{n}")
+    with pytest.raises(InputError, match=r"there are: series 3 .* and \d+ more\. Choose") as raised:
+        read_ct(tmp_path / "ct")
+    assert len(str(raised.value)) < 1500
+
+
+@pytest.mark.parametrize("modality", ["CT", "OT"])
+def test_a_uid_for_each_slice_is_told_as_that(tmp_path: Path, modality: str) -> None:
+    folder = tmp_path / "ct"
+    for n, data in enumerate(write_series(folder, Modality=modality)):
         data.SeriesInstanceUID = generate_uid()
         data.save_as(folder / f"IM{250 - n:04d}")
     with pytest.raises(InputError, match="each of its 7 DICOM files has a SeriesInstanceUID of its own"):
