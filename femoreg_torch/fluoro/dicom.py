@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from femoreg_torch.arrays import check_pixels, quiet
 from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro.suffixes import ITK_SUFFIXES, PICTURE_SUFFIXES, SCREEN_SUFFIXES
 from femoreg_torch.fluoro.tags import Tags, find_value, read_tags, value_in
 from femoreg_torch.paths import check_readable
 from femoreg_torch.volume.dicom import damaged_header, is_dicom
@@ -53,6 +54,11 @@ def carm_settings(path: Path) -> dict[str, Any]:
 
     Raises `InputError` that names the tags that are missing.
     """
+    if path.name.lower().endswith(PICTURE_SUFFIXES + SCREEN_SUFFIXES + ITK_SUFFIXES):
+        raise InputError(
+            f"{path}: is no DICOM file, whose header could tell the C-arm. Name a preset, or write its settings "
+            "under `carm:`: sdd_mm, pixel_mm and shape."
+        )
     tags = read_header(path)
     told = {"sdd_mm": tags.sdd_mm, "pixel_mm": tags.pixel_mm, "shape": tags.shape}
     names = {"sdd_mm": "DistanceSourceToDetector", "pixel_mm": "ImagerPixelSpacing", "shape": "Rows, Columns"}
@@ -82,7 +88,10 @@ def _dataset(path: Path, **options: Any) -> Any:
     try:
         dataset = pydicom.dcmread(path, force=is_dicom(path), **options)  # some are written without a preamble
     except InvalidDicomError as error:
-        raise InputError(f"{path}: not a DICOM file, and its name ends in no known suffix of an image.") from error
+        raise InputError(
+            f"{path}: not a DICOM file, and its name ends in no known suffix of an image "
+            f"({', '.join(PICTURE_SUFFIXES + SCREEN_SUFFIXES + ITK_SUFFIXES)}). Save it as 16-bit TIFF or PNG."
+        ) from error
     if "TransferSyntaxUID" not in dataset.file_meta:  # nor with what says how they are coded, which the first tags show
         implicit, _ = dataset.original_encoding
         dataset.file_meta.TransferSyntaxUID = ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian

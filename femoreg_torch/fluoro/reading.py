@@ -20,6 +20,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.files import temporary_file
 from femoreg_torch.fluoro.dicom import SCREEN, DicomImage, Frames, read_dicom, read_header
 from femoreg_torch.fluoro.png import chunks_are_there
+from femoreg_torch.fluoro.suffixes import ITK_SUFFIXES, PICTURE_SUFFIXES, SCREEN_SUFFIXES
 from femoreg_torch.fluoro.tags import Tags
 from femoreg_torch.geometry import Camera
 from femoreg_torch.paths import check_readable
@@ -28,10 +29,7 @@ from femoreg_torch.text import read_bytes
 from femoreg_torch.volume.dicom import is_dicom
 from femoreg_torch.volume.itk import read_itk
 
-_ITK_SUFFIXES = (".nii", ".nii.gz", ".mha", ".mhd", ".nrrd")
-_PICTURE_SUFFIXES = (".png", ".tif", ".tiff")
 _PAGED_SUFFIXES = (".tif", ".tiff")
-_SCREEN_SUFFIXES = (".jpg", ".jpeg", ".bmp")  # what nobody stores intensities in
 _IN_COLOUR = "is a grey picture stored in colour, as pictures of a screen are: is its curve that of the detector?"
 LOOKS_LOG = "looks like logarithms already"  # what a file of fractions asks the case about
 _LOG_RANGE = (2.0, 20.0)  # of the greatest attenuation in an image: 45 cm of water at 60 keV are 9
@@ -82,10 +80,10 @@ def _read_picture(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
         )
     if path.suffix.lower() in _PAGED_SUFFIXES:
         _check_tiff(path, content, image)
-    screen = path.suffix.lower() in _SCREEN_SUFFIXES or image.dtype == np.uint8
+    screen = path.suffix.lower() in SCREEN_SUFFIXES or image.dtype == np.uint8
     if image.ndim == 3 and image.shape[-1] in (3, 4):
         colours = image[..., :3].astype(np.int64)
-        if np.ptp(colours, axis=-1).max() <= (_GREY_STEPS if path.suffix.lower() in _SCREEN_SUFFIXES else 0):
+        if np.ptp(colours, axis=-1).max() <= (_GREY_STEPS if path.suffix.lower() in SCREEN_SUFFIXES else 0):
             return image[..., 1], (SCREEN if screen else _IN_COLOUR,)
     return image, (SCREEN,) if screen else ()
 
@@ -161,9 +159,9 @@ def read_stored(path: Path, frames: Frames | None = None) -> StoredImage:
     name = path.name.lower()
     dicom: DicomImage | None = None
     remarks: tuple[str, ...] = ()
-    if name.endswith(_PICTURE_SUFFIXES + _SCREEN_SUFFIXES):
+    if name.endswith(PICTURE_SUFFIXES + SCREEN_SUFFIXES):
         array, remarks = _read_picture(path)
-    elif name.endswith(_ITK_SUFFIXES):
+    elif name.endswith(ITK_SUFFIXES):
         array = _read_itk(path)
     else:
         dicom = read_dicom(path, frames)
@@ -194,7 +192,7 @@ def may_be_image(path: Path) -> bool:
 
     Exports hold others beside them: DICOMDIR, reports, presentation states, a viewer.
     """
-    if path.name.lower().endswith(_PICTURE_SUFFIXES + _SCREEN_SUFFIXES + _ITK_SUFFIXES):
+    if path.name.lower().endswith(PICTURE_SUFFIXES + SCREEN_SUFFIXES + ITK_SUFFIXES):
         return True
     return is_dicom(path) and read_header(path).shape is not None
 
@@ -226,8 +224,8 @@ def settled_intensity(said: Literal["raw", "log"] | None, image: StoredImage, wh
 def write_image(path: Path, image: Tensor) -> None:
     """Write a 16-bit grey image (H, W), dtype uint16, as TIFF or PNG by the suffix of `path`."""
     path = Path(path)
-    if image.dtype != torch.uint16 or image.ndim != 2 or path.suffix.lower() not in _PICTURE_SUFFIXES:
-        raise InputError(f"{path}: a (H, W) uint16 image and a name in {', '.join(_PICTURE_SUFFIXES)} were expected.")
+    if image.dtype != torch.uint16 or image.ndim != 2 or path.suffix.lower() not in PICTURE_SUFFIXES:
+        raise InputError(f"{path}: a (H, W) uint16 image and a name in {', '.join(PICTURE_SUFFIXES)} were expected.")
     with temporary_file(path) as part:
         write_picture(part, image.numpy())
 

@@ -170,10 +170,10 @@ def _middle_of_detector(
 def _field(dataset: Any, shape: tuple[int, int] | None) -> Circle | Polygon | Overlap | None:
     """What all that a header tells leaves: a round display shutter, say, and the blades of a collimator within.
 
-    A collimator that leaves nothing, as edges of 0 in place of unknown ones do, is passed over.
+    A shape that leaves nothing, as edges of 0 in place of unknown ones do, is passed over.
     """
-    blades = [one for one in _shapes(dataset, "Collimator") if shape is None or one.exposed(shape).any()]
-    shapes = (*_shapes(dataset, "Shutter"), *blades)
+    told = (*_shapes(dataset, "Shutter"), *_shapes(dataset, "Collimator"))
+    shapes = tuple(one for one in told if shape is None or one.exposed(shape).any())
     return Overlap(shapes) if len(shapes) > 1 else next(iter(shapes), None)
 
 

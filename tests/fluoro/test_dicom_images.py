@@ -342,7 +342,7 @@ def test_blades_within_a_round_shutter_leave_what_lies_in_both(tmp_path: Path, b
     assert field is not None
     round_, square = Circle((3.0, 2.0), 2.0), Polygon(((2.0, 0.0), (6.0, 0.0), (6.0, 3.0), (2.0, 3.0)))
     assert torch.equal(field.exposed((5, 7)), round_.exposed((5, 7)) & square.exposed((5, 7)))
-    unknown = {f"Collimator{name}Edge": 0 for name in names} | {"CollimatorShape": "RECTANGULAR"}
+    unknown = {f"{blades}{name}Edge": 0 for name in names} | {f"{blades}Shape": "RECTANGULAR"}
     assert read_header(write(tmp_path, **unknown)).field is None
 
 
@@ -456,3 +456,12 @@ def test_a_header_that_cannot_be_parsed_is_told_with_its_file(tmp_path: Path) ->
     path.write_bytes(content[: rows + 6] + b"\x03\x00" + content[rows + 8 : rows + 10] + b"\0" + content[rows + 10 :])
     with pytest.raises(InputError, match="its DICOM header cannot be read"):
         read_header(path)
+
+
+def test_a_picture_has_no_header_that_tells_the_c_arm(tmp_path: Path) -> None:
+    (tmp_path / "view1.tif").write_bytes(b"II*\0")
+    with pytest.raises(InputError, match=r"view1\.tif: is no DICOM file, whose header could tell the C-arm"):
+        carm_settings(tmp_path / "view1.tif")
+    (tmp_path / "view1.gif").write_bytes(b"GIF89a")
+    with pytest.raises(InputError, match=r"no known suffix of an image \(\.png, \.tif, .*Save it as 16-bit TIFF"):
+        read_stored(tmp_path / "view1.gif")
