@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 _SAME_SIZE = 0.01  # voxels, of what rounding may make of them
 _SAME_PLACE_MM = 0.5  # of any voxel, by what stands twice in a header
 _BEYOND = 2**20  # bytes that are decompressed after the last voxel, to come to the end of the file
+_GZIP = b"\x1f\x8b"  # RFC 1952
+_HEADER_SIZES = ((348).to_bytes(4, "little"), (348).to_bytes(4, "big"))  # what a NIfTI-1 header begins with
 NIFTI_SUFFIXES = (".nii", ".nii.gz", ".hdr", ".img", ".img.gz")
 
 
@@ -29,6 +31,7 @@ def check_nifti(path: Path) -> None:
     """
     if not path.name.lower().endswith(NIFTI_SUFFIXES):
         return
+    _check_name(path)
     import nibabel  # takes a tenth of a second, beside the reading of images
 
     try:
@@ -55,10 +58,21 @@ def check_nifti(path: Path) -> None:
     except InputError:
         raise
     except Exception as error:  # nibabel's readers raise whatever their parsing runs into
-        reason = " ".join(str(error).replace(str(path), "it").split()).rstrip(".")[:200]
+        reason = " ".join(str(error).replace(str(path), path.name).split()).rstrip(".")[:200]
         raise InputError(f"{path}: cannot be read as NIfTI ({reason}). Export or download it anew.") from error
     if values.dtype.kind in "fc" and not np.isfinite(values).all():
         raise InputError(f"{path}: holds values that are not finite (NaN or infinite). Repair or export it anew.")
+
+
+def _check_name(path: Path) -> None:
+    """Raises `InputError` for a file that is compressed and whose name does not say so, or the other way round."""
+    with opened(path) as file:
+        head = file.read(4)
+    named = path.suffix.lower() == ".gz"
+    if head[:2] == _GZIP and not named:
+        raise InputError(f"{path}: is compressed, and its name does not say so. Rename it to {path.name}.gz.")
+    if named and head in _HEADER_SIZES:
+        raise InputError(f"{path}: is not compressed, and its name says so. Rename it to {path.stem}.")
 
 
 def _check_kind(path: Path, image: Any) -> None:

@@ -323,8 +323,15 @@ def test_a_compressed_nifti_whose_last_bytes_are_missing(dtype: str, missing: in
 def test_a_nifti_that_only_claims_to_be_compressed_is_refused(tmp_path: Path) -> None:
     nibabel.save(nifti("int16"), tmp_path / "ct.nii")
     (tmp_path / "ct.nii").rename(tmp_path / "ct.nii.gz")
-    with pytest.raises(InputError, match=r"cannot be read as NIfTI \(.*not a gzip file"):
+    with pytest.raises(InputError, match=r"is not compressed, and its name says so. Rename it to ct.nii\."):
         read_ct(tmp_path / "ct.nii.gz")
+
+
+def test_a_compressed_nifti_whose_name_does_not_say_so_is_to_be_renamed(tmp_path: Path) -> None:
+    nibabel.save(nifti("int16"), tmp_path / "ct.nii.gz")
+    (tmp_path / "ct.nii.gz").rename(tmp_path / "ct.nii")
+    with pytest.raises(InputError, match=r"is compressed, and its name does not say so\. Rename it to ct\.nii\.gz\."):
+        read_ct(tmp_path / "ct.nii")
 
 
 def test_a_nifti_compressed_in_several_parts_is_read(tmp_path: Path) -> None:
