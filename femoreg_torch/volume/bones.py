@@ -107,10 +107,13 @@ def _check_table(there: set[int], table: LabelTable, anatomy: Anatomy | None) ->
     if not wanted or wanted & there or not (fitting := fitting_tables(there)):
         return
     ids = ", ".join(map(str, sorted(wanted)))
+    one = len(fitting) == 1
+    name = fitting[0] if one else "NAME"
+    advice = "Name that one:" if one else "Name the one of them by whose program the map was made:"
     raise InputError(
         f"label map: no voxel carries the {' or '.join(sorted(named))} of its table ({ids}), but hip bones and femora "
-        f"of the table {' and of '.join(fitting)} are there. Name that one: `--bones {fitting[0]}`, or "
-        f"`bones: {fitting[0]}` under `ct:` in case.yaml."
+        f"of the table {' and of '.join(fitting)} are there. {advice} `--bones {name}`, or `bones: {name}` under `ct:` "
+        "in case.yaml."
     )
 
 

@@ -1,5 +1,6 @@
 """A case made of the files that users have: what it then holds, and that it appears whole or not at all."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -480,6 +481,16 @@ def test_a_table_that_is_not_that_of_the_map_is_told_with_the_one_that_is(
     assert main(["landmarks", ct, str(path), "--out", out]) == 2
     assert "hip bones and femora of totalsegmentator_v2 are there" in capsys.readouterr().err
     assert main(["landmarks", ct, str(path), "--out", out, "--bones", "totalsegmentator_v2"]) == 0
+
+
+def test_of_several_tables_that_fit_none_is_named_as_the_right_one(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ids 1 to 6 are those of three tables; the first of them has other bones there."""
+    assert main(arguments(files, tmp_path / "case", bones="totalsegmentator_v2")) == 2
+    told = capsys.readouterr().err
+    assert re.search(r"of the table autoseg and of .*femoreg.* are there\. Name the one of them by whose program", told)
+    assert "--bones autoseg" not in told
 
 
 def test_landmarks_go_by_the_names_of_the_parts_whatever_their_values(
