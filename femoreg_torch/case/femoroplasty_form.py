@@ -178,12 +178,16 @@ def read_device_start(device: Fields, folder: Path, path: PlannedPath, side: Sid
     """The nominal pose: in camera 1, beside the femur, or in words. Raises `InputError`."""
     in_camera, beside, words = DEVICE_STARTS
     told = [key for key in DEVICE_STARTS if key in device]
-    if len(told) != 1:
-        found = " and ".join(f"`{key}`" for key in told) or "none"
+    if len(told) > 1:
+        raise InputError(
+            f"{device.where(told[1])}: the nominal pose of the device is given {len(told)} times, as "
+            f"{' and '.join(f'`{key}`' for key in told)}. Keep one of them."
+        )
+    if not told:
         raise InputError(
             f"{device.where(in_camera)}: is missing, the nominal pose of the device was expected once, as "
             f"`{in_camera}` (4×4), `{beside}` (4×4 or a transform of 3D Slicer), or `{words}: {{guide: {ALONG_PATH}, "
-            f"before_entry_mm: 20}}`; found {found}."
+            f"before_entry_mm: 20}}`."
         )
     if in_camera in device:
         return Start(camera1_from=device.transform(in_camera))

@@ -99,7 +99,10 @@ def test_a_transform_of_slicer_puts_the_device_where_slicer_shows_it(tmp_path: P
     ("content", "message"),
     [
         ({}, "the nominal pose of the device was expected once"),
-        ({"start": {}, "femur_from_device": "a.tfm"}, "found `femur_from_device` and `start`"),
+        (
+            {"start": {}, "femur_from_device": "a.tfm"},
+            "device.start: the nominal pose of the device is given 2 times, as `femur_from_device` and `start`",
+        ),
         ({"start": {"guide": "upwards"}}, r"device\.start: guide: one of along the planned path, from the side"),
         ({"start": {"before": 3}}, "unknown key 'before'"),
         ({"start": {"turned_deg": "much"}}, r"device\.start: .*turned_deg"),
