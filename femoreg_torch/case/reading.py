@@ -74,8 +74,10 @@ def read_version(top: Fields) -> int:
     version = top.value("version", " or ".join(map(str, VERSIONS)))
     if type(version) is not int or version not in VERSIONS:
         known = " and ".join(map(str, VERSIONS))
+        quoted = isinstance(version, str) and version.strip() in map(str, VERSIONS)
+        mend = " Take the quotes away: it is a number." if quoted else ""
         raise InputError(
-            f"{top.where('version')}: this FemoReg Torch reads versions {known}, found {shortened(version)}."
+            f"{top.where('version')}: this FemoReg Torch reads versions {known}, found {shortened(version)}.{mend}"
         )
     return version
 

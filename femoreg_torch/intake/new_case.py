@@ -30,6 +30,7 @@ from femoreg_torch.fluoro import Display, Source, carm_settings, may_be_image, n
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.check import check_case
 from femoreg_torch.intake.label_tables import table_of_map
+from femoreg_torch.intake.volumes import header_warnings
 from femoreg_torch.paths import why_unreadable
 from femoreg_torch.segment import load_bone_network, propose_landmarks, segment_bones
 from femoreg_torch.volume import (
@@ -182,7 +183,7 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
         notes += more
         labels_name, labels = _labels(folder, given.labels, ct, bones, notes)
     landmarks = given_landmarks or _proposed(labels, ct, bones, notes)
-    side = given.side or _side(labels, ct, bones, landmarks, entry_point, notes)
+    side = given.side or _side(labels, ct, bones, landmarks, entry_point, header_warnings(given.ct), notes)
     if femoral_head(side) not in landmarks:
         raise InputError(
             f"{given.landmarks or '--segment'}: {femoral_head(side)}, the head of the operated femur, is "
@@ -270,9 +271,15 @@ def _labels(folder: Path, path: Path, ct: Volume, bones: LabelTable, notes: list
 
 
 def _side(
-    labels: Volume, ct: Volume, bones: LabelTable, landmarks: dict[str, Tensor], entry_point: Tensor, notes: list[str]
+    labels: Volume,
+    ct: Volume,
+    bones: LabelTable,
+    landmarks: dict[str, Tensor],
+    entry_point: Tensor,
+    doubts: list[str],
+    notes: list[str],
 ) -> Side:
-    """The side whose femur the entry point lies on. Raises `InputError` if it lies on none."""
+    """The side whose femur the entry point lies on. Raises `InputError` if it lies on none, with `doubts` of the CT."""
     found = bone_labels(labels, ct, bones, HIP, landmarks)
     sides = {found.ids[operated_femur(side)]: side for side in ("left", "right") if operated_femur(side) in found.ids}
     label = nearest_label(found.labels, list(sides), entry_point) if sides else None
@@ -281,6 +288,7 @@ def _side(
         raise InputError(
             f"--side: is missing, and the entry point ({where}) mm LPS lies on no femur of the label map. Give the "
             "side, and check the plan's coordinate system (RAS or LPS)."
+            + "".join(f" Of the CT, {doubt}." for doubt in doubts)
         )
     notes.append(f"the operated side is the {sides[label]} one, as the entry point lies on its femur")
     return cast(Side, sides[label])

@@ -18,6 +18,7 @@ _COARSE_MM, _COARSE_STEP_MM = 1.5, 3.0  # the registration takes voxels of 1 mm
 _SOFT_HU, _BONE_HU, _METAL_HU = -50.0, 300.0, 2800.0
 _LEAST_AIR = 0.005  # share of the voxels; beside every patient there is some
 _METAL_ML = 1.0
+_MOST_PADDING_HU = -3100.0
 _SPACES_WITHOUT_A_PATIENT = tuple(
     name + time for name in (b"scanner-xyz", b"3d-right-handed", b"3d-left-handed") for time in (b"", b"-time")
 )  # NRRD format, section 5.1
@@ -49,8 +50,15 @@ def ct_warnings(ct: Volume) -> list[str]:
     if low > _SOFT_HU or high < _BONE_HU:
         told.append(f"values from {low:g} to {high:g} are not HU of a hip: air is −1000, bone above {_BONE_HU:g}")
         return told
-    if low == 0 or high > 60000 or float((ct.data < -3100).float().mean()) > 0:
-        told.append(f"values from {low:g} to {high:g}: is the rescale of the scanner applied?")
+    if low == 0 or high > 60000 or low < _MOST_PADDING_HU:
+        filled = low <= _MOST_PADDING_HU and float((ct.data < -1100).float().mean()) == float(
+            (ct.data == low).float().mean()
+        )
+        told.append(
+            f"values from {low:g} to {high:g}: what lies outside the scanner's circle seems to be filled with {low:g}"
+            if filled
+            else f"values from {low:g} to {high:g}: is the rescale of the scanner applied?"
+        )
     air = float((ct.data < -500).float().mean())
     if air < _LEAST_AIR:
         told.append("hardly any air: the CT seems to be cropped inside the patient, so soft tissue is missing")

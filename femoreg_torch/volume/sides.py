@@ -13,6 +13,7 @@ _CLOSER_MM, _FAR_MM = 2.0, 30.0
 _ON_MM, _OFF_MM = 2.0, 6.0  # so near to a bone a landmark lies on it, and so far away it does not
 _ACROSS_MM = 12.0  # labels leak across a symphysis or into a joint by less
 _BESIDE_MM = 5.0  # seen of 17 right cases: at most 1.3; those that people place are 2 to 3 mm off
+_METRES_MM = 2.0  # no patient is so small, and none lies farther from a scanner's middle in metres
 _RAS = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
 
 
@@ -80,6 +81,11 @@ def stray_landmarks(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy:
         return [
             f"landmarks: {', '.join(stray)} lie on no bone, but would with x and y negated: the file holds RAS and "
             "says LPS, or the other way round. Correct its coordinate system"
+        ]
+    if len(stray) == len(asked) > 1 and max(float(landmarks[name].abs().max()) for name in stray) < _METRES_MM:
+        return [
+            f"landmarks: {', '.join(stray)} lie within {_METRES_MM:g} mm of the origin: are they in metres? "
+            "Multiply them by 1000"
         ]
     return [f"landmarks: {', '.join(stray)} lie far from the bones that they are named after. Place them anew"]
 

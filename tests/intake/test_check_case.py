@@ -98,6 +98,11 @@ def rescaled(c: Content, folder: Path, offset: int) -> None:
     nibabel.save(nibabel.Nifti1Image(values, ras_affine()), folder / "ct.nii.gz")
 
 
+def metres(c: Content, folder: Path) -> None:
+    points = {name: tuple(v / 1000 for v in point) for name, point in landmarks().items()}
+    (folder / "landmarks.mrk.json").write_text(markups(points), encoding="utf-8")
+
+
 def masked(c: Content, folder: Path) -> None:
     cv2.imwrite(str(folder / "mask.png"), np.eye(20, dtype=np.uint8))
     c["views"][1].update(field="mask.png")
@@ -337,6 +342,24 @@ def test_the_registration_refuses_landmarks_on_other_bones(
     assert any(told in one for one in check_case(folder, find_start=False).problems)
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (metres, r"landmarks: FH-l, .* lie within 2 mm of the origin: are they in metres\?"),
+        (lambda c, f: c.update(version="2"), r"version: .* found '2'\. Take the quotes away"),
+    ],
+)
+def test_what_mends_all_at_once_is_told(
+    files: Path, tmp_path: Path, change: Callable[[Content, Path], object], told: str
+) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    content = case_content()
+    change(content, folder)
+    write_content(folder, content)
+    assert any(re.search(told, problem) for problem in check_case(folder, find_start=False).problems)
+
+
 def test_what_is_no_case_is_told(tmp_path: Path) -> None:
     assert "holds no case.yaml" in check_case(tmp_path).problems[0]
     (tmp_path / "case.yaml").write_text("- a list", encoding="utf-8")
@@ -360,6 +383,8 @@ def test_warnings_of_a_ct(files: Path) -> None:
     metal = ct.with_data(ct.data.clone())
     metal.data[30:34, 20:24, 40:44] = 3000
     assert any("metal" in one for one in ct_warnings(metal))
+    padded = ct.with_data(torch.where(torch.arange(len(ct.data))[:, None, None] < 2, -32768.0, ct.data.float()))
+    assert any("seems to be filled with -32768" in one for one in ct_warnings(padded))
     cut = type(ct)(ct.data[:, :, 20:].contiguous(), ct.lps_from_index)
     assert any("bone is cut at the right face" in one for one in ct_warnings(cut))
 

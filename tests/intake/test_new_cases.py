@@ -483,14 +483,30 @@ def test_a_table_that_is_not_that_of_the_map_is_told_with_the_one_that_is(
     assert main(["landmarks", ct, str(path), "--out", out, "--bones", "totalsegmentator_v2"]) == 0
 
 
+def test_a_path_beside_a_ct_without_a_place_is_told_with_that(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("ct", "labels"):
+        image = nibabel.load(files / f"{name}.nii.gz")
+        image.set_sform(ras_affine(), 0)
+        image.set_qform(ras_affine(), 0)
+        nibabel.save(image, tmp_path / f"{name}.nii.gz")
+    bare = {"labels": tmp_path / "labels.nii.gz", "ct": tmp_path / "ct.nii.gz", "bones": "femoreg"}
+    assert main(arguments(files, tmp_path / "case", **bare)) == 2
+    told = capsys.readouterr().err
+    assert "lies on no femur of the label map" in told
+    assert "Of the CT, the NIfTI header has neither sform nor qform" in told
+
+
 def test_of_several_tables_that_fit_none_is_named_as_the_right_one(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Ids 1 to 6 are those of three tables; the first of them has other bones there."""
-    assert main(arguments(files, tmp_path / "case", bones="totalsegmentator_v2")) == 2
+    """Small ids are those of several tables; the first of them has other bones there."""
+    words = arguments(files, tmp_path / "case", labels=files / "labels.nii.gz", bones="totalsegmentator_v2")
+    assert main(words) == 2
     told = capsys.readouterr().err
-    assert re.search(r"of the table autoseg and of .*femoreg.* are there\. Name the one of them by whose program", told)
-    assert "--bones autoseg" not in told
+    assert re.search(r"of the table \w+ and of \w+.* are there\. Name the one of them by whose program", told)
+    assert "--bones NAME" in told
 
 
 def test_landmarks_go_by_the_names_of_the_parts_whatever_their_values(
