@@ -18,9 +18,9 @@ _MEDIANS_MM, _SHIFTS_MM = 3.0, 2.0  # apart are the voxels that are looked at, o
 # Bones of plastic foam are as light, but their shells are not: of real ones the densest twentieth then has −380 to 290.
 _LEAST_BONE_HU, _LEAST_CORTEX_HU, _MOST_SOFT_HU = -150.0, 350.0, 350.0
 # A CT that is not the label map's: of the labels' voxels so few are denser than 19 of 20 beside them, and in the median
-# they are denser by so little, HU. Of two procedural, three real and five simulated right CTs 0.78 to 0.96 were, by 90
-# to 380; with fatty marrow 0.39 to 0.76, by −3 to 380; of sacrum or femora alone 0.24 to 0.34. Of the same CTs turned
-# by 180° or flipped head to foot or front to back 0.03 to 0.19 were, by −770 to 29.
+# they are denser by so little, HU. Of two procedural, three real and five simulated right CTs 0.78 to 0.96 were, by 147
+# to 379; with marrow of fat 0.39 to 0.83, by −3 on; of sacrum or femora alone 0.24 to 0.34, by −56 on. Of the same CTs
+# turned by 180° or flipped head to foot or front to back 0.03 to 0.19 were, by −772 to 29.
 _LEAST_DENSER, _LEAST_RISE_HU = 0.2, 40.0
 _MOST_VALUES = 20_000  # a quantile needs no more
 _REACH_MM = 18.0  # how far a label map is looked for: a best place beyond the farthest shift that is told is none
