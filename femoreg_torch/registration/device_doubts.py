@@ -23,8 +23,9 @@ from femoreg_torch.volume import guide_end
 _CASTS_NO_SHADOW = 0.004  # 1/mm: a fifth of water
 _MOST_WITHOUT_SHADOW = 0.08  # share of a model's volume
 # Shadow, the logarithm of how much less light there is with a device, below which an image shows none, and over how
-# many pixels it is averaged. Blocks of steel that leave scattered light alone cast one shadow whatever is in them.
-_NO_SHADOW, _AVERAGED_PX = 0.15, 5
+# much of the detector it is averaged. Blocks of steel that leave scattered light alone cast one shadow whatever is in
+# them.
+_NO_SHADOW, _AVERAGED_MM = 0.15, 1.0
 _ENCLOSED_MM = 2.5  # half of the width of a gap that counts as within: a drill in its sleeve
 # Another place of a device, of the similarity that it adds where it was found, without its best view: of wires beside
 # another one 0.44 and 0.48; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
@@ -110,12 +111,14 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
 def _where_no_shadow_is(scene: Scene) -> Scene:
     """The same with only those pixels exposed that have as much light as in the image without the device."""
 
+    radius = int(_AVERAGED_MM / scene.carm.camera.mean_pixel_mm / 2)
+
     def left(kind: Kind, view: int) -> Tensor | None:
         exposed, first = scene.field(kind, view), scene.first_kind
         if kind == first or not (scene.there([first], [view]) and scene.there([kind], [view])):
             return exposed
         shadow = scene.image(kind, view) - scene.image(first, view)
-        bright = avg_pool2d(shadow[None], _AVERAGED_PX, 1, _AVERAGED_PX // 2)[0] < _NO_SHADOW
+        bright = avg_pool2d(shadow[None], 2 * radius + 1, 1, radius, count_include_pad=False)[0] < _NO_SHADOW
         return bright if exposed is None else exposed & bright
 
     return replace(scene, fields={kind: tuple(left(kind, v) for v in range(scene.views)) for kind in scene.images})

@@ -7,12 +7,13 @@ import torch
 from registration_scenes import float64, make_scene, true_poses
 
 from femoreg_torch.case import Start
+from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Poses, about_point, exp_se3, pose_difference, transform_points
 from femoreg_torch.registration import Level, Scene, load_plan
 from femoreg_torch.registration.roundness import Axis
 from femoreg_torch.registration.scene import RigidObject
-from femoreg_torch.registration.turn_search import TurnSearch
+from femoreg_torch.registration.turn_search import TurnSearch, turned_from_where_told
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume, axis_aligned
 
@@ -78,6 +79,17 @@ def test_a_turn_that_is_right_stays_as_it_is(scene: Scene) -> None:
     right = Poses(TRUTH.camera_from_camera1, {"probe": TRUTH.camera1_from["device"]})
     (record,) = SEARCH.run(scene, right, seed=0)
     assert torch.equal(record.poses.camera1_from["probe"], right.camera1_from["probe"])
+
+
+def test_a_turn_that_is_found_far_from_the_nominal_one_is_told(scene: Scene) -> None:
+    """A mirrored model may fit as well as one that was turned round, so the nominal pose has to agree."""
+    before = StageRecord("device, coarse", None, 0.5, 1, 0.1, "small step", turned(120), moving=("probe",))
+    (far,) = SEARCH.run(scene, turned(120), seed=0)
+    (near,) = SEARCH.run(scene, turned(3), seed=0)
+    (doubt,) = turned_from_where_told([SEARCH], [before, far])
+    assert "the probe was found turned by 1" in doubt
+    assert turned_from_where_told([SEARCH], [replace(before, poses=turned(3)), near]) == ()
+    assert turned_from_where_told([], [before, far]) == ()
 
 
 def test_what_has_no_guide_or_is_round_is_left_out(scene: Scene) -> None:
