@@ -16,6 +16,7 @@ from femoreg_torch.registration import OrbitSearch, Plan, Stage, Step
 from femoreg_torch.registration.calibration import Calibration
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene, Segmentation
+from femoreg_torch.registration.turn_search import TurnSearch
 from femoreg_torch.volume import Volume, axis_aligned
 
 CARM = CArm(centred_camera(1020.0, (3.0, 3.0), (88, 88)), (0.0, 0.0, 632.0), (0.0, 1.0, 0.0))
@@ -181,7 +182,7 @@ def quicker(plan: Plan) -> Plan:
     """
 
     def changed(step: Step) -> Step:
-        if isinstance(step, Calibration):
+        if isinstance(step, Calibration | TurnSearch):
             return step
         assert isinstance(step, Stage | OrbitSearch)
         step = replace(step, level=replace(step.level, step_mm=3.0))
