@@ -40,28 +40,35 @@ def start_from_a_view(
 ) -> StartRecord:
     """The start in view 1 by what the network sees there (`detection`), or from another view that shows more.
 
-    Another view is asked where view 1 has no start or one of few landmarks. Raises `InputError` as `start_by_detection`
-    does, if no other view has a start or view 1 does not fit what is found from there.
+    Another view is asked where view 1 has no start or one of few landmarks; in the latter case it is taken if the
+    outlines of the bones agree better there. Raises `InputError` as `start_by_detection` does, if no other view has a
+    start or view 1 does not fit what is found from there.
     """
-    refused: InputError | None = None
+    refused, least = None, 0.0
     try:
         found = start_in_view_1(case, scene, detection)
         if not found.few:
             return record_from_view_1(case, scene, detection, found)
+        least = found.overlap or 0.0
     except InputError as error:
         refused = error
-    if (other := _from_another_view(case, scene, plan, find, seed)) is not None:
+    if (other := _from_another_view(case, scene, plan, find, seed, least)) is not None:
         return other
     if refused is not None:
         raise why_there_is_no_start(case, scene, refused, find) from refused
     return record_from_view_1(case, scene, detection, found)
 
 
-def _from_another_view(case: Case, scene: Scene, plan: Plan, find: Detector, seed: int) -> StartRecord | None:
+def _from_another_view(
+    case: Case, scene: Scene, plan: Plan, find: Detector, seed: int, least: float
+) -> StartRecord | None:
+    """The start from another view whose outlines agree by more than `least` (Dice), None if there is none."""
     best = best_other_view(case, scene, case.anatomy or HIP, find)
     if best is None:
         return None
     view, start = best
+    if start.overlap is not None and start.overlap <= least:
+        return None
     if scene.camera_from_camera1 is not None:
         camera1_from = torch.linalg.inv(scene.camera_from_camera1[view]) @ start.camera_from_ct
         return record_from_view(view, scene.anchor, camera1_from, start)
