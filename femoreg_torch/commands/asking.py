@@ -54,9 +54,17 @@ def ask_for_missing(given: NewCase, console: Console) -> NewCase:
 
 
 def _asked(question: str, console: Console, may_be_empty: bool, read: Callable[[str], Answer]) -> Answer | None:
-    """The first answer that can be read; None if it is empty and may be. Others are told, and asked for again."""
+    """The first answer that can be read; None if it is empty and may be. Others are told, and asked for again.
+
+    Raises `InputError` where the typing ended before an answer.
+    """
     while True:
-        answer = (Prompt.ask(question, console=console, default="", show_default=False) or "").strip()
+        try:
+            answer = (Prompt.ask(question, console=console, default="", show_default=False) or "").strip()
+        except EOFError:
+            raise InputError(
+                f"the input ended where this was asked for: {question}. Type an answer, or give it as an option."
+            ) from None
         if not answer and may_be_empty:
             return None
         if answer:

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from femoreg_torch.commands import asking
 from femoreg_torch.commands.asking import ask_for_missing
+from femoreg_torch.errors import InputError
 from femoreg_torch.intake import NewCase
 
 
@@ -58,3 +59,12 @@ def test_what_must_be_there_is_asked_for_until_it_is(files: Path, monkeypatch: p
     asked, said = given_answers(monkeypatch, "", "~/ct.nii.gz", "~/plan.mrk.json", "", "~/b.dcm", "")
     assert asked.ct == files / "ct.nii.gz"
     assert said == ""
+
+
+def test_an_input_that_ends_is_told_with_what_was_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def at_its_end(*_: object, **__: object) -> str:
+        raise EOFError
+
+    monkeypatch.setattr(asking.Prompt, "ask", at_its_end)
+    with pytest.raises(InputError, match=r"the input ended where this was asked for: .*CT"):
+        ask_for_missing(NewCase(), Console(file=io.StringIO()))
