@@ -35,7 +35,13 @@ from femoreg_torch.optimize import Quadratic
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.intrinsics import Intrinsics, Profile, profile
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.motion import MotionBetween, drifts_between_views, motions_between
+from femoreg_torch.registration.motion import (
+    AlongGuide,
+    MotionBetween,
+    drifts_along_guides,
+    drifts_between_views,
+    motions_between,
+)
 from femoreg_torch.registration.objective import image_costs, mean_quadratic
 from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, reference_point_in_view
 from femoreg_torch.similarity import Similarity
@@ -62,6 +68,7 @@ class PoseCovariance:
     step: Tensor  # (6 B,): where all images together would move the bodies, were all free with these intrinsics
     motions: tuple[MotionBetween, ...] = ()  # of the anatomy between kinds of images, were it free to move
     drifts: tuple[MotionBetween, ...] = ()  # of what other kinds of images show alone, in single views
+    along_guides: tuple[AlongGuide, ...] = ()  # of tools in single views
 
     def of(self, first: str, second: str | None = None) -> Tensor:
         """The block (6, 6) of one body, or of two."""
@@ -175,6 +182,7 @@ def pose_covariance(
         -inverse @ model.gradient[:rigid],
         motions_between(scene, parts, images, objects, centres),
         drifts_between_views(scene, parts, images, objects, centres),
+        drifts_along_guides(scene, poses, parts, images, objects, centres),
     )
 
 

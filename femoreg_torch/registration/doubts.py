@@ -27,7 +27,7 @@ from femoreg_torch.registration.device_doubts import (
 from femoreg_torch.registration.handedness import Handedness, handedness
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.misfits import misfits
-from femoreg_torch.registration.motion import MotionBetween
+from femoreg_torch.registration.motion import AlongGuide, MotionBetween
 from femoreg_torch.registration.objective import ImageCosts
 from femoreg_torch.registration.orbit import orbits
 from femoreg_torch.registration.quality import Limits, shift_px
@@ -49,6 +49,9 @@ _MOST_MOTION_MM, _MOST_MOTION_DEG, _SURE_OF_MOTION, _SURE_IN_ALL = 0.3, 0.3, 3.0
 # it moved by 1.2 mm and 0.8° between the views: 0.0014 to 0.0057, in all of eight at least 3.4 deviations; on images
 # of another simulator 0.0031 and 2.4.
 _GAIN_OF_DRIFT, _GAIN_OF_SURE_DRIFT = 0.002, 0.0008
+# Of a tool along and about its guide in one view alone.
+_MOST_SLIDE_MM, _SURE_OF_SLIDE, _GAIN_OF_SLIDE = 0.6, 3.0, 0.0003
+_MOST_TURN_DEG, _SURE_OF_TURN, _GAIN_OF_TURN = 2.0, 1.5, 0.0003
 # Of a bone in one view, beside the others. Where a leg had turned by 1.8° from view to view: 0.018, and where a neck
 # had broken 0.0029 and more. Of 16 right ones of two simulators, with bad CTs, shutters and metal too: at most 0.0007.
 _GAIN_OF_BONE_DRIFT = 0.003
@@ -224,7 +227,7 @@ def doubts_about_motion(covariance: PoseCovariance) -> tuple[str, ...]:
         if any(sure(each) for each in motions)
     ]
     if not moved:
-        return ()
+        return doubts_about_guides(covariance)
     found = max(moved, key=lambda each: each.gain)
     deg, mm = found.size
     view = f" of view {found.views[0] + 1}"
@@ -244,6 +247,19 @@ def doubts_about_motion(covariance: PoseCovariance) -> tuple[str, ...]:
     return (
         f"in the {found.kind} images{where}, {lies} lie{'s' if len(found.objects) == 1 else ''} {mm:.1f} mm and "
         f"{deg:.1f}° from where the other images show them: {who} has moved between the images; take them again",
+    )
+
+
+def doubts_about_guides(covariance: PoseCovariance) -> tuple[str, ...]:
+    """A tool that slid along its guide or turned about it in one view, in words: what explains the images best."""
+    moved = [each for each in covariance.along_guides if _has_slid(each)]
+    if not moved:
+        return ()
+    found = max(moved, key=lambda each: each.gain)
+    how = "is turned by {:.0f}° about its guide" if found.turns else "lies {:.1f} mm along its guide"
+    return (
+        f"in the {found.kind} image of view {found.view + 1}, the {found.name} {how.format(abs(found.amount))} from "
+        "where the other views show it: it has moved between the views; hold it still and take them again",
     )
 
 
@@ -267,6 +283,14 @@ def _has_drifted(found: MotionBetween) -> bool:
     if found.kind is None:
         return found.gain > _GAIN_OF_BONE_DRIFT
     return found.gain > _GAIN_OF_DRIFT or (found.gain > _GAIN_OF_SURE_DRIFT and found.sureness > _SURE_OF_MOTION)
+
+
+def _has_slid(found: AlongGuide) -> bool:
+    if found.turns:
+        most, sure, gain = _MOST_TURN_DEG, _SURE_OF_TURN, _GAIN_OF_TURN
+    else:
+        most, sure, gain = _MOST_SLIDE_MM, _SURE_OF_SLIDE, _GAIN_OF_SLIDE
+    return abs(found.amount) > most and found.sureness > sure and found.gain > gain
 
 
 def doubts_about_the_plan(case: Case, scene: Scene) -> tuple[str, ...]:

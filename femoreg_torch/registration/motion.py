@@ -16,6 +16,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.optimize import Quadratic
 from femoreg_torch.registration.scene import Kind, Scene
@@ -48,6 +49,24 @@ class MotionBetween:
     def sureness(self) -> float:
         """The motion by its standard deviations: the most certain of its six parts."""
         return float((self.motion.abs() / self.deviation).max())
+
+
+@dataclass(frozen=True)
+class AlongGuide:
+    """How a tool lies in one view along or about its guide, beside where its other views show it."""
+
+    kind: Kind
+    view: int  # from 0
+    name: str
+    turns: bool  # about the guide, by degrees; else it slides along it, towards the tip, by mm
+    amount: float
+    deviation: float
+    gain: float  # by which it lowers the cost
+
+    @property
+    def sureness(self) -> float:
+        """The amount by its standard deviation."""
+        return abs(self.amount) / self.deviation if self.deviation else 0.0
 
 
 def motions_between(
@@ -98,6 +117,39 @@ def drifts_between_views(
     return tuple(found)
 
 
+def drifts_along_guides(
+    scene: Scene,
+    poses: Poses,
+    parts: Sequence[Quadratic],
+    images: Sequence[Image],
+    names: Sequence[str],
+    centres: Tensor,
+) -> tuple[AlongGuide, ...]:
+    """Slides of every tool along its guide, and turns about it, in one view beside its other views.
+
+    A hand that holds a tool lets it slide or turn so most easily. One unknown is told far more surely than the six of
+    `drifts_between_views`. Of tools with a known guide; of round ones no turn. `parts`, `images`, `names` and `centres`
+    are as for `motions_between`.
+    """
+    found = []
+    for n, name in enumerate(names):
+        guide, shown = scene.objects[name].guide, scene.objects[name].shown_in
+        views = tuple(dict.fromkeys((kind, view) for kind, view in images if kind in shown))
+        if guide is None or scene.first_kind in shown or len(views) < 2:
+            continue
+        base, tip = transform_points(poses.camera1_from[name], torch.stack(guide))
+        axis = (tip - base) / (tip - base).norm()
+        turn = torch.cat([axis, torch.linalg.cross(axis, centres[n] - base) * torch.pi / 180])
+        slide = torch.cat([torch.zeros_like(axis), axis])
+        for turns, way in ((False, slide), (True, turn)):
+            moves = torch.zeros(len(centres), 6, 1, dtype=torch.float64)
+            moves[n, :, 0] = way
+            for kind, view in views if not turns or scene.objects[name].axis is None else ():
+                amount, deviation, gain = _step(parts, [each == (kind, view) for each in images], moves.flatten(0, 1))
+                found.append(AlongGuide(kind, view, name, turns, float(amount), float(deviation), gain))
+    return tuple(found)
+
+
 def _moves(bodies: Sequence[int], centres: Tensor) -> Tensor:
     """Twists (6 B, 6) of all bodies about their centres when some move as one about the centre of the first of them."""
     moves = torch.zeros(len(centres), 6, 6, dtype=torch.float64)
@@ -108,13 +160,14 @@ def _moves(bodies: Sequence[int], centres: Tensor) -> Tensor:
 
 
 def _step(parts: Sequence[Quadratic], chosen: Sequence[bool], moves: Tensor) -> tuple[Tensor, Tensor, float]:
-    """Newton's step (6,) of a motion in the chosen images, all bodies refitted; its deviations (6,), and what it gains.
+    """Newton's step (k,) of a motion in the chosen images, all bodies refitted; its deviations (k,), and what it gains.
 
-    The gain is that of a step cut to what is in reach; where the cost does not bend up, nothing is gained. Scores vary
-    about their mean over the tiles of each image, as a motion gives all of them one sign.
+    `moves` (6 B, k) are the twists of all bodies in each unknown of the motion. The gain is that of a step cut to what
+    is in reach; where the cost does not bend up, nothing is gained. Scores vary about their mean over the tiles of each
+    image, as a motion gives all of them one sign.
     """
     n = len(moves)
-    stay = torch.cat([torch.eye(n, dtype=torch.float64), torch.zeros_like(moves)], 1)  # (n, n + 6)
+    stay = torch.cat([torch.eye(n, dtype=torch.float64), torch.zeros_like(moves)], 1)  # (n, n + k)
     move = torch.cat([torch.eye(n, dtype=torch.float64), moves], 1)
     ways = [move if here else stay for here in chosen]
     hessian = torch.stack([w.T @ part.hessian[:n, :n] @ w for part, w in zip(parts, ways, strict=True)]).sum(0)

@@ -1,15 +1,19 @@
 """Motion of the patient between images without and with the device: found, told, not seen where there is none."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from registration_scenes import REFERENCE_POINTS, make_scene, off, true_poses
+from torch import Tensor
 
+from femoreg_torch.geometry import about_point, exp_se3
 from femoreg_torch.registration.covariance import pose_covariance
-from femoreg_torch.registration.doubts import doubts_about_motion
+from femoreg_torch.registration.doubts import doubts_about_guides, doubts_about_motion
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.motion import MotionBetween
+from femoreg_torch.registration.motion import AlongGuide, MotionBetween
+from femoreg_torch.registration.roundness import Axis
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.similarity import GradNcc
 
@@ -139,3 +143,72 @@ def test_a_drift_is_told_by_what_it_gains_and_how_sure_it_is(gain: float, sigmas
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(), drifts=(drift,)
     )
     assert len(doubts_about_motion(covariance)) == told
+
+
+def _held(way: Tensor, view: int) -> Scene:
+    """A scene whose device has a guide, and lay elsewhere in one view's image: moved by a twist along its own axes."""
+    truth = true_poses()
+    still = make_scene(truth)
+    base = _GUIDE[0]
+    device = replace(still.objects["device"], guide=_GUIDE)
+    about_base = truth.camera1_from["device"] @ about_point(exp_se3(way), base)
+    moved = make_scene(truth.with_object("device", about_base), seed=1).images["device"]
+    images = tuple(moved[n] if n == view else still.images["device"][n] for n in range(3))
+    return replace(still, images=still.images | {"device": images}, objects=still.objects | {"device": device})
+
+
+_GUIDE = torch.tensor([0.0, 0, -40], dtype=torch.float64), torch.tensor([0.0, 0, 40], dtype=torch.float64)
+_SLIDE = torch.tensor([0.0, 0, 0, 0, 0, 1.0], dtype=torch.float64)
+_TURNED = torch.tensor([0.0, 0, math.radians(5), 0, 0, 0], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("way", "turns", "amount"), [(_SLIDE, False, 1.0), (_TURNED, True, 5.0)])
+@pytest.mark.parametrize("view", [0, 1, 2])
+def test_a_slide_or_a_turn_in_one_view_is_measured(way: Tensor, turns: bool, amount: float, view: int) -> None:
+    """By an independent motion of the device in the image of that view, on pixels of 3 mm."""
+    covariance = pose_covariance(_held(way, view), true_poses(), _LEVEL, GradNcc(1))
+    found = {(each.view, each.turns): each for each in covariance.along_guides}
+    assert set(found) == {(n, t) for n in range(3) for t in (False, True)}
+    moved = found[view, turns]
+    assert moved.amount == pytest.approx(amount, abs=1.5 * moved.deviation)
+    assert moved.sureness > 2
+    assert max((found[n, turns] for n in range(3)), key=lambda each: each.gain) == moved
+
+
+def test_a_device_that_was_held_still_neither_slides_nor_turns() -> None:
+    covariance = pose_covariance(_held(torch.zeros(6, dtype=torch.float64), 1), true_poses(), _LEVEL, GradNcc(1))
+    assert max(each.sureness for each in covariance.along_guides) < 3
+    assert doubts_about_guides(covariance) == ()
+
+
+def test_a_round_device_is_not_asked_for_its_turn() -> None:
+    scene = _held(_SLIDE, 1)
+    axis = Axis(torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0, 1], dtype=torch.float64))
+    scene = replace(scene, objects=scene.objects | {"device": replace(scene.objects["device"], axis=axis)})
+    covariance = pose_covariance(scene, true_poses(), _LEVEL, GradNcc(1))
+    assert {each.turns for each in covariance.along_guides} == {False}
+
+
+@pytest.mark.parametrize(
+    ("turns", "amount", "sigmas", "gain", "words"),
+    [
+        (False, 1.4, 5, 0.001, "view 2, the device lies 1.4 mm along its guide"),
+        (True, -3.4, 2.5, 0.001, "view 2, the device is turned by 3° about its guide"),
+        (False, 0.4, 5, 0.001, None),  # small
+        (True, 1.5, 5, 0.001, None),
+        (False, 1.4, 2, 0.001, None),  # unsure
+        (True, 3.4, 1.2, 0.001, None),
+        (False, 1.4, 5, 0.0001, None),  # explains nothing
+        (True, 3.4, 2.5, 0.0001, None),
+    ],
+)
+def test_what_is_far_sure_and_explains_something_is_told(
+    turns: bool, amount: float, sigmas: float, gain: float, words: str | None
+) -> None:
+    found = AlongGuide("device", 1, "device", turns, amount, abs(amount) / sigmas, gain)
+    covariance = replace(
+        pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), drifts=(), along_guides=(found,)
+    )
+    told = doubts_about_motion(covariance)
+    assert len(told) == (words is not None)
+    assert words is None or words in told[0]
