@@ -1,6 +1,6 @@
 """Case folders and results: one directory describes one procedure, and every command reads and writes it."""
 
-from femoreg_torch.case.model import Case, CaseObject, Model, Part, PlannedPath, Side, Start, View
+from femoreg_torch.case.model import Case, CaseObject, Model, Part, PlannedPath, Side, Start, View, anchor_of
 from femoreg_torch.case.quality import CameraQuality, ObjectQuality, ViewQuality
 from femoreg_torch.case.reading import case_folder, read_case
 from femoreg_torch.case.result import LandmarkRecord, Result, StartRecord
@@ -28,6 +28,7 @@ __all__ = [
     "Verdict",
     "View",
     "ViewQuality",
+    "anchor_of",
     "case_folder",
     "new_folder",
     "read_case",

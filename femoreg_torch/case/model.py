@@ -1,6 +1,7 @@
 """What one procedure consists of: rigid objects, fluoroscopic images, and how each object starts."""
 
 import dataclasses
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -41,6 +42,17 @@ class Start:
     def by_landmarks(self) -> bool:
         """Whether landmarks place it."""
         return self.camera1_from is None and self.beside is None
+
+
+def anchor_of(shown: Sequence[str], starts: Mapping[str, Start], bones: Collection[str]) -> str:
+    """Of objects by name, the one in whose space a registration and its pictures stand.
+
+    It is the one that landmarks place, else the first bone that images show, else the first object that they show, else
+    the first one. Landmarks and CT lie in its space if landmarks place it or it is a bone; what is a model has a space
+    of its own, which they have nothing to do with.
+    """
+    placed = [name for name, start in starts.items() if start.by_landmarks]
+    return next(iter([*placed, *(name for name in shown if name in bones), *shown, *starts]))
 
 
 @dataclass(frozen=True)

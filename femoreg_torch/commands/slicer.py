@@ -7,8 +7,9 @@ def slicer(run: Path, *, case: Path | None = None, out: Path | None = None) -> N
     """Write a result as a scene of 3D Slicer: drag scene.mrml into its window.
 
     Shows, in the space of the CT: the CT where it is a file, the surface of every object where it was found, below a
-    transform `<anchor>_from_<object>`, the landmarks, the planned path and the guide. A scene says in a comment whether
-    its result is trusted.
+    transform `<anchor>_from_<object>`, the landmarks, the planned path and the guide. CT and landmarks are left out
+    where nothing that was registered is a bone of the CT or placed by landmarks. A scene says in a comment whether its
+    result is trusted.
 
     Args:
         run: Folder that `femoreg register` wrote.
@@ -22,7 +23,7 @@ def slicer(run: Path, *, case: Path | None = None, out: Path | None = None) -> N
     from femoreg_torch.commands.replay import case_of
     from femoreg_torch.evaluation.fit import check_fits, check_plan_fits
     from femoreg_torch.files import check_new_folder
-    from femoreg_torch.neighbours.slicer import SCENE_FOLDER, SCENE_NAME, write_scene
+    from femoreg_torch.neighbours.slicer import SCENE_FOLDER, SCENE_NAME, outside_ct, write_scene
 
     result = read_result(run)
     of = case_folder(case_of(run, result, case))
@@ -33,4 +34,11 @@ def slicer(run: Path, *, case: Path | None = None, out: Path | None = None) -> N
     check_plan_fits(content, result)
     with new_folder(folder) as built:
         write_scene(built, content, result, standing=folder)
+    if outside_ct(content, result) and (content.ct_path is not None or content.landmarks):
+        Console(stderr=True).print(
+            "CT and landmarks are left out: no object that was registered is a bone of the CT or placed by landmarks.",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
     Console().print(f"Scene written to {folder / SCENE_NAME}", markup=False, highlight=False, soft_wrap=True)

@@ -1,8 +1,9 @@
 """A result as a scene of 3D Slicer: CT, surfaces of all objects where they were found, landmarks, path and guide.
 
-The scene stands in the space of the anchor, which is that of the CT where it is a bone. Every other object hangs below
-a transform `<anchor>_from_<object>`. All files are in LPS and say so: surfaces in the header of their STL file, which
-3D Slicer reads since 4.11, markups in `coordinateSystem`, transforms as ITK stores them.
+The scene stands in the space of the anchor: of what landmarks place, else of the first bone. That is the CT's, whatever
+comes first in the case. Every other object hangs below a transform `<anchor>_from_<object>`. All files are in LPS and
+say so: surfaces in the header of their STL file, which 3D Slicer reads since 4.11, markups in `coordinateSystem`,
+transforms as ITK stores them.
 """
 
 import os
@@ -16,7 +17,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from femoreg_torch.case import Case, CaseObject, Result
+from femoreg_torch.case import Case, CaseObject, Result, anchor_of
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import write_json, write_text
 from femoreg_torch.geometry import invert_rigid
@@ -36,13 +37,15 @@ _SMOOTH_PX = 0.7  # of a mask, before its surface is taken
 def write_scene(folder: Path, case: Case, result: Result, standing: Path | None = None) -> list[str]:
     """Write the scene of a result and its files into `folder`; returns the names of the files.
 
-    The CT is named where it lies, seen from `standing`, where the folder will be (itself by default). Raises
-    `InputError` for what the case does not hold.
+    The CT is named where it lies, seen from `standing`, where the folder will be (itself by default). CT and landmarks
+    are left out where no object lies in their space, see `outside_ct`. Raises `InputError` for what the case does not
+    hold.
     """
-    poses, anchor = result.poses.camera1_from, result.anchor
+    poses, anchor = result.poses.camera1_from, _anchor(case, result)
     bones = read_bones(case)[1] if any(case.objects[name].model is None for name in poses) else None
     scene = _Scene(folder, standing or folder)
-    if case.ct_path is not None and case.ct_path.is_file():
+    in_ct = not outside_ct(case, result)
+    if in_ct and case.ct_path is not None and case.ct_path.is_file():
         scene.volume("CT", case.ct_path)
     anchor_from = {name: invert_rigid(poses[anchor]) @ pose for name, pose in poses.items()}
     for name, pose in anchor_from.items():
@@ -51,9 +54,25 @@ def write_scene(folder: Path, case: Case, result: Result, standing: Path | None 
         scene.model(name, _surface(case, case.objects[name], bones), colour, below)
         for line, ends in _lines(case, name).items():
             scene.line(line, ends, below)
-    if case.landmarks:
+    if in_ct and case.landmarks:
         scene.landmarks(case.landmarks)
     return scene.finish(result)
+
+
+def outside_ct(case: Case, result: Result) -> bool:
+    """Whether nothing that was registered lies in the CT's space: only models with a start of their own."""
+    anchor = case.objects[_anchor(case, result)]
+    return anchor.model is not None and not anchor.start.by_landmarks
+
+
+def _anchor(case: Case, result: Result) -> str:
+    """The object in whose space the scene stands, of those that were registered."""
+    found = list(result.poses.camera1_from)
+    return anchor_of(
+        found,
+        {name: case.objects[name].start for name in found},
+        [name for name in found if case.objects[name].model is None],
+    )
 
 
 def _lines(case: Case, name: str) -> dict[str, tuple[Tensor, Tensor]]:
