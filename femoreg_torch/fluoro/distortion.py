@@ -15,10 +15,12 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro.collimation import exposed_field
 from femoreg_torch.geometry import Camera
 
 _DEGREES = (5, 3)  # of the polynomial: the first one that has spots enough
@@ -78,9 +80,10 @@ class Distortion:
 def find_distortion(grid: Tensor, camera: Camera, pitch_mm: float, where: str) -> Distortion:
     """The distortion of pictures of `camera`, from the raw image (H, W) of a square grid.
 
-    Raises `InputError` that starts with `where` if no grid of this pitch is seen, with too few spots, or not as one.
+    Spots are looked for where the detector is exposed, within the black ring of an image intensifier. Raises
+    `InputError` that starts with `where` if no grid of this pitch is seen, with too few spots, or not as one.
     """
-    seen = find_grid_spots(grid)
+    seen = find_grid_spots(grid, exposed_field(grid, camera))
     mm = np.array([camera.pixel_mm[1], camera.pixel_mm[0]])
     index = _indices(seen * mm, pitch_mm, where)
     known = np.isfinite(index[:, 0])
@@ -100,20 +103,31 @@ def find_distortion(grid: Tensor, camera: Camera, pitch_mm: float, where: str) -
     return Distortion(camera.shape, degree, terms, len(seen), residual, greatest)
 
 
-def find_grid_spots(grid: Tensor) -> Array:
-    """Middles (N, 2), column and row, of the small spots in an image, all darker or all brighter than around them."""
-    image = np.log(np.maximum(grid.double().numpy(), 1e-6 * float(grid.max())))
+def find_grid_spots(grid: Tensor, field: Tensor | None = None) -> Array:
+    """Middles (N, 2), column and row, of the small spots in an image, all darker or all brighter than around them.
+
+    Only the exposed `field` (H, W), bool, counts (None: all): what lies outside it, the black ring of an image
+    intensifier say, is nearly nothing, whose logarithm would swamp that of the spots. Spots that its edge cuts are left
+    out, as their middles are not to be seen.
+    """
+    inside = np.ones(grid.shape, bool) if field is None else field.numpy()
+    raw = grid.double().numpy()
+    image = np.log(np.maximum(raw, 1e-6 * float(raw[inside].max())))
+    if field is not None:  # each pixel outside as the nearest one inside, so that the edge is none
+        image = image[tuple(ndimage.distance_transform_edt(~inside, return_distances=False, return_indices=True))]
     scale = 255 / max(float(np.ptp(image)), 1e-12)
     small = ((image - image.min()) * scale).astype(np.uint8)
     width = 2 * (max(image.shape) // 60) + 3  # wider than a ball, narrower than the pitch
     around = cv2.medianBlur(small, width).astype(np.float64) / scale + image.min()
     response = cv2.GaussianBlur(image - around, (0, 0), 1.0)
-    response = response if np.quantile(response, 0.999) > -np.quantile(response, 0.001) else -response
-    level = 0.5 * float(np.quantile(response, 0.999))
-    _, parts, counts, middles = cv2.connectedComponentsWithStats((response > level).astype(np.uint8))
+    low, high = np.quantile(response[inside], [0.001, 0.999])
+    response, level = (response, 0.5 * high) if high > -low else (-response, -0.5 * low)
+    spots = ((response > level) & inside).astype(np.uint8)
+    _, parts, counts, middles = cv2.connectedComponentsWithStats(spots)
     areas = counts[1:, cv2.CC_STAT_AREA]
     usual = np.median(areas) if len(areas) else 0
-    kept = 1 + np.flatnonzero((areas > 0.3 * usual) & (areas < 3 * usual))
+    whole = ~np.isin(np.arange(1, len(counts)), parts[ndimage.binary_dilation(~inside)])
+    kept = 1 + np.flatnonzero((areas > 0.3 * usual) & (areas < 3 * usual) & whole)
     rows, columns = np.indices(image.shape)
     weight = np.where(np.isin(parts, kept), response.clip(0), 0.0)
     total = np.bincount(parts.ravel(), weight.ravel(), minlength=len(middles))[kept]

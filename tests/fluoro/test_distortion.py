@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import find_distortion, find_grid_spots
-from femoreg_torch.geometry import Camera
+from femoreg_torch.geometry import Camera, centred_camera
 
 CAMERA = Camera(1000.0, (0.9, 0.9), (300, 320), (159.5, 149.5))
 MIDDLE = np.array([159.5, 149.5])
@@ -61,6 +62,53 @@ def test_a_known_distortion_is_found_and_taken_off(bright: bool) -> None:
     mask = found.straightened(torch.ones(CAMERA.shape, dtype=torch.bool))
     assert mask.dtype == torch.bool
     assert mask.all()
+
+
+def ringed_grid(
+    pixel_mm: tuple[float, float], top: float, ring: tuple[float, float], bright: bool
+) -> tuple[Camera, torch.Tensor, np.ndarray, np.ndarray]:
+    """An image intensifier's picture of a grid of 12 mm within a black ring, of level and noise `ring`.
+
+    With its camera, the places of the straight grid, mm, and where they are seen, px, of spots wholly in the field.
+    """
+    shape = tuple(round(240 / mm) for mm in pixel_mm)
+    camera = centred_camera(1000.0, pixel_mm, (shape[0], shape[1]))
+    middle, mm = np.array(camera.principal_point_px), np.array(pixel_mm[::-1])
+    line = 12.0 * np.arange(-11, 12)
+    grid = np.stack(np.meshgrid(line + 1.3, line - 2.2), -1).reshape(-1, 2)
+    squared = (grid**2).sum(1, keepdims=True) / 110**2
+    angle = 0.05 + 0.03 * squared  # a twist that grows outwards, and pincushion
+    x, y = grid[:, :1], grid[:, 1:]
+    turned = np.concatenate([x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle)], 1)
+    seen = (1 + 0.05 * squared) * turned
+    rows, columns = np.indices(shape)
+    away = np.stack([columns, rows], -1) * mm - middle * mm
+    shade = np.exp(-0.5 * cKDTree(seen).query(away)[0] ** 2 / 1.2**2)
+    generator = np.random.default_rng(3)
+    level = 0.5 if bright else 1.0
+    picture = top * level * np.exp((0.7 if bright else -0.7) * shade) + generator.normal(0, 0.003 * top, shape)
+    black = np.linalg.norm(away, axis=-1) > 112
+    picture = np.where(black, generator.normal(*ring, shape), picture).clip(0).round()
+    whole = np.linalg.norm(seen, axis=1) < 104
+    return camera, torch.from_numpy(picture).float(), grid[whole], seen[whole] / mm + middle
+
+
+@pytest.mark.parametrize("pixel_mm", [(0.5, 0.5), (0.6, 0.5)])
+@pytest.mark.parametrize(
+    ("top", "ring"), [(30000, (0, 0)), (30000, (200, 10)), (30000, (200, 100)), (3500, (8, 3)), (3500, (2, 2))]
+)
+@pytest.mark.parametrize("bright", [False, True])
+def test_the_black_ring_of_an_image_intensifier_hides_no_spot(
+    pixel_mm: tuple[float, float], top: float, ring: tuple[float, float], bright: bool
+) -> None:
+    camera, picture, straight, seen = ringed_grid(pixel_mm, top, ring, bright)
+    found = find_distortion(picture, camera, 12.0, "grid.tif")
+    assert found.spots >= len(seen)
+    mm = np.array(pixel_mm[::-1])
+    again = found.straight(torch.from_numpy(seen)).numpy() * mm
+    a, b = again - again.mean(0), straight - straight.mean(0)
+    u, _, v = np.linalg.svd(b.T @ a)
+    assert np.abs(a - b @ (u @ v)).max() < 0.25
 
 
 def test_what_is_no_grid_is_refused() -> None:
