@@ -106,8 +106,9 @@ def beside_table(first: pd.DataFrame, second: pd.DataFrame, names: tuple[str, st
         data.append(_numbers("success", found))
     how = "Paired: differences of the same procedures." if pairs is not None else "Not paired: different procedures."
     note = (
-        f"{how} 95 %: bootstrap of the difference, runs of one procedure drawn together; clear if it does not hold 0, "
-        "– where it is not known, as of unpaired studies with several runs of a procedure. "
+        f"{how} 95 %: bootstrap of the difference, runs of one procedure drawn together; of few, Student's or Welch's, "
+        "and of shares that are not paired, Newcombe's. Clear if it does not hold 0, – where it is not known, as of "
+        "unpaired studies with several runs of a procedure, or of differences that are all the same. "
         "Runs that gave no error are in no mean; in the share of good runs they count as not good."
     )
     columns = ("mean error", "runs", *names, "difference", "95 %", "clear")

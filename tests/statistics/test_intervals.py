@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, t
 
 from femoreg_torch.statistics.intervals import difference_interval, mean_interval, pearson, rate_interval, spearman
 
@@ -63,7 +63,41 @@ def test_ranks_in_perfect_order_tell_nothing_of_their_spread() -> None:
 @pytest.mark.parametrize("values", [[], [1.0], [2.0, 2.0, 2.0]])
 def test_a_sample_that_says_nothing_of_its_spread_has_no_interval(values: list[float]) -> None:
     assert all(math.isnan(end) for end in mean_interval(values, 0))
-    assert all(math.isnan(end) for end in difference_interval(values, [1.0, 2.0], 0))
+    assert all(math.isnan(end) for end in difference_interval(values, [3.0, 3.0], 0))
+
+
+@pytest.mark.parametrize("count", [3, 30])
+def test_a_difference_takes_its_spread_from_the_sample_that_has_one(count: int) -> None:
+    """Beside a constant it is Student's interval of the other mean."""
+    values = np.random.default_rng(4).normal(5, 1, count)
+    half = t.ppf(0.975, count - 1) * values.std(ddof=1) / math.sqrt(count)
+    expected = values.mean() - 2 - half, values.mean() - 2 + half
+    assert difference_interval(values, np.full(20, 2.0), 0) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ((56, 70), (48, 80), (0.0524, 0.3339)),
+        ((9, 10), (3, 10), (0.1705, 0.8090)),
+        ((5, 56), (0, 29), (-0.0381, 0.1926)),
+        ((0, 10), (0, 20), (-0.1611, 0.2775)),
+        ((10, 10), (0, 20), (0.6791, 1.0)),
+    ],
+)
+def test_the_interval_of_a_difference_of_rates_is_newcombes(
+    first: tuple[int, int], second: tuple[int, int], expected: tuple[float, float]
+) -> None:
+    """The figures of his Table II, method 10."""
+    samples = [np.arange(of) < met for met, of in (first, second)]
+    assert difference_interval(*samples, 0) == pytest.approx(expected, abs=6e-5)
+
+
+def test_a_study_without_failure_beside_one_with_some_has_an_interval_that_holds() -> None:
+    """Of 1000 pairs of 40 runs that succeed in 98 and 90 %; a third of the first has no failure."""
+    rng = np.random.default_rng(6)
+    pairs = [difference_interval(rng.random(40) < 0.98, rng.random(40) < 0.90, 0) for _ in range(1000)]
+    assert np.mean([low <= 0.08 <= high for low, high in pairs]) > 0.93
 
 
 def test_the_interval_of_a_rate_is_wilsons() -> None:
