@@ -20,7 +20,8 @@ from femoreg_torch.registration.scene import Scene
 from femoreg_torch.statistics.figures import write_figures
 from femoreg_torch.statistics.formats import pipe_table
 from femoreg_torch.statistics.rows import DONE, VARIED
-from sim.study.capture_figure import capture_figure
+from femoreg_torch.statistics.summary import Rate, independent
+from sim.study.capture_figure import capture_figure, shading
 from sim.study.cases import Stores
 from sim.study.code import digest
 from sim.study.conditions import Imaged, body_of, made_once
@@ -120,21 +121,23 @@ def plan_capture(setting: Setting, chosen: Sequence[Procedure], stores: Stores, 
     return Study(runs, Displaced(setting, stores, imaged))
 
 
-def success_rates(rows: pd.DataFrame) -> dict[str, list[tuple[float, int, int]]]:
-    """(offset, successes, starts) of every level of every sweep; each begins with the starts at the truth.
+def success_rates(rows: pd.DataFrame) -> dict[str, list[tuple[float, Rate]]]:
+    """(offset, rate of success) at every level of every sweep; each begins with the starts at the truth.
 
-    Success: the pelvis within 10 mm and 2° of the truth. Runs that a defect has ended are left out.
+    Success: the pelvis within 10 mm and 2° of the truth. Runs that a defect has ended are left out. Several starts on
+    one procedure are not independent.
     """
     done = rows[rows["status"].eq(DONE)]
     share, sweep = done[f"{VARIED}share"], done[f"{VARIED}sweep"]
     good = done[f"{PELVIS}_mm"].le(SUCCESS_MM) & done[f"{PELVIS}_deg"].le(SUCCESS_DEG)
-    rates: dict[str, list[tuple[float, int, int]]] = {}
+    rates: dict[str, list[tuple[float, Rate]]] = {}
     for name in AXIS_LABELS:
         rates[name] = []
         for level in _SHARES:
-            here = good[share.eq(level) & (sweep.eq(name) | (level == 0))]
-            if len(here):
-                rates[name].append((level * FULL.get(name, 100.0), int(here.sum()), len(here)))
+            here = share.eq(level) & (sweep.eq(name) | (level == 0))
+            if here.any():
+                rate = Rate(int(good[here].sum()), int(here.sum()), independent(done[here]))
+                rates[name].append((level * FULL.get(name, 100.0), rate))
     return rates
 
 
@@ -148,15 +151,14 @@ def write_capture(rows: pd.DataFrame, plan: Plan, command: str, out: Path, docs:
     title = f"Capture range of the pelvis in view 1, {plan.preset}"
     (picture,) = write_figures([capture_figure(rates, AXIS_LABELS, f"capture_{plan.preset}", title)], out)
     lines = [
-        [sweep, *(f"{value:g}: {good} of {starts}" for value, good, starts in points)]
-        for sweep, points in rates.items()
+        [sweep, *(f"{value:g}: {rate.met} of {rate.of}" for value, rate in points)] for sweep, points in rates.items()
     ]
     text = "\n\n".join(
         [
             f"`{command}`: the stages of the first view ({names}) from starts off the "
             f"truth, on {rows['number'].nunique()} simulated procedures. Success: the middle of the pelvis within "
             f"{SUCCESS_MM:g} mm and its rotation within {SUCCESS_DEG:g}° afterwards; the femur starts as the CT has "
-            "it. Shaded: 95 % interval.",
+            f"it. {shading(rates)}",
             f"![Success rate against start offset](capture_{plan.preset}.png)",
             pipe_table(("offset: successes", *([""] * (len(LEVELS) + 1))), lines),
             f"Jointly: % of {FULL['rotation']:g}°, {FULL['depth']:g} mm and {FULL['lateral']:g} mm at once. "

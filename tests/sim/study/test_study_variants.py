@@ -11,8 +11,10 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import rotation_angle, transform_points
 from femoreg_torch.registration import OrbitSearch, Stage, load_plan
 from femoreg_torch.statistics.intervals import rate_interval
+from femoreg_torch.statistics.summary import Rate
 from sim.study.ablation import Variant, plan_of, read_variants
-from sim.study.capture import LEVELS, first_stages, offset, success_rates
+from sim.study.capture import AXIS_LABELS, LEVELS, first_stages, offset, success_rates
+from sim.study.capture_figure import capture_figure
 from sim.study.starts import displaced
 
 POSE = torch.tensor([[1, 0, 0, 5], [0, 0, -1, -8], [0, 1, 0, 760], [0, 0, 0, 1]], dtype=torch.float64)
@@ -45,6 +47,12 @@ def test_a_start_is_off_by_what_its_sweep_says(
     assert {round(along / 50) for _, along, _ in found} == ways  # towards the source and away from it
 
 
+def capture_rows(starts: list[tuple[str, str, float, float, float]], numbers: list[int]) -> pd.DataFrame:
+    """Rows of starts (status, sweep, share, mm, degrees), each on the procedure of a number."""
+    rows = pd.DataFrame(starts, columns=["status", "varied_sweep", "varied_share", "pelvis_mm", "pelvis_deg"])
+    return rows.assign(number=numbers, patient="a", side="left", seed=0)
+
+
 def test_success_needs_both_place_and_rotation() -> None:
     starts = [
         ("done", "rotation", 0.0, 1, 0.1),
@@ -53,12 +61,22 @@ def test_success_needs_both_place_and_rotation() -> None:
         ("done", "depth", 0.2, 0.1, 2.1),
         ("failed", "depth", 0.2, np.nan, np.nan),
     ]
-    rows = pd.DataFrame(starts, columns=["status", "varied_sweep", "varied_share", "pelvis_mm", "pelvis_deg"])
-    rates = success_rates(rows)
-    assert rates["rotation"] == [(0.0, 1, 1), (pytest.approx(6.0), 1, 2)]
-    assert rates["depth"] == [(0.0, 1, 1), (pytest.approx(20.0), 0, 1)]
-    assert rates["jointly"] == [(0.0, 1, 1)]
+    rates = success_rates(capture_rows(starts, [1, 1, 2, 1, 2]))
+    assert rates["rotation"] == [(0.0, Rate(1, 1)), (pytest.approx(6.0), Rate(1, 2))]
+    assert rates["depth"] == [(0.0, Rate(1, 1)), (pytest.approx(20.0), Rate(0, 1))]
+    assert rates["jointly"] == [(0.0, Rate(1, 1))]
     assert max(LEVELS) == 1
+
+
+@pytest.mark.parametrize(("numbers", "shaded"), [([1, 2, 3, 4], True), ([1, 1, 2, 2], False)])
+def test_starts_that_share_procedures_have_no_interval(numbers: list[int], shaded: bool) -> None:
+    """Four starts at the truth and four off it, on four procedures or twice on two."""
+    starts = [("done", "rotation", share, mm, 0.1) for share in (0.0, 0.2) for mm in (1.0, 2.0, 3.0, 40.0)]
+    rates = success_rates(capture_rows(starts, numbers * 2))
+    assert [rate.independent for _, rate in rates["rotation"]] == [shaded, shaded]
+    plot = capture_figure(rates, AXIS_LABELS, "capture", "title")
+    assert [bool(axes.collections) for axes in plot.figure.axes] == [shaded] * len(AXIS_LABELS)
+    assert ("Shaded" in plot.caption) is shaded
 
 
 def test_interval_of_a_rate() -> None:

@@ -119,9 +119,9 @@ def test_starts_at_the_truth_and_off_it_are_runs_of_a_study(coarse_root: Path, t
     plan = plan_capture(setting, [PROCEDURE], stores, imaged, starts=1)
     assert run_study(plan, out, OnThisMachine(1)).status == {"done": 21}  # the truth, and five levels of four sweeps
     rates = success_rates(read_rows(out / TABLE_NAME))
-    assert [[starts for _, _, starts in points] for points in rates.values()] == [[1] * 6] * 4
-    assert rates["depth"][0][1] == 1  # 16 evaluations do not lead far away from the truth
-    assert rates["jointly"][-1][1] == 0  # nor from 30°, 100 mm and 40 mm back to it
+    assert [[rate.of for _, rate in points] for points in rates.values()] == [[1] * 6] * 4
+    assert rates["depth"][0][1].met == 1  # 16 evaluations do not lead far away from the truth
+    assert rates["jointly"][-1][1].met == 0  # nor from 30°, 100 mm and 40 mm back to it
     text = write_capture(read_rows(out / TABLE_NAME), setting.plan, "the command", out, tmp_path)
     assert text.startswith("`the command`: ")
     assert "on 1 simulated procedures" in text
