@@ -19,7 +19,7 @@ from femoreg_torch.registration.plan import Stage
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.statistics.figures import write_figures
 from femoreg_torch.statistics.formats import pipe_table
-from femoreg_torch.statistics.rows import DONE, VARIED
+from femoreg_torch.statistics.rows import DONE, REFUSED, VARIED
 from femoreg_torch.statistics.summary import Rate, independent
 from sim.study.capture_figure import capture_figure, shading
 from sim.study.cases import Stores
@@ -84,7 +84,10 @@ def _started(case: Case, scene: Scene, points: ReferencePoints, plan: Plan, vari
     by = offset(varied["sweep"], varied["share"])
     generator = torch.Generator().manual_seed(1000 * _SHARES.index(varied["share"]) + start)
     pose = displaced(truth.camera1_from[PELVIS], scene.objects[PELVIS].reference_point, by, generator)
-    poses = run_plan(scene, plan, pose, start, lambda *_: None).poses
+    try:
+        poses = run_plan(scene, plan, pose, start, lambda *_: None).poses
+    except InputError as error:  # no defect: from there the images show nothing to go by, say
+        return {"refused": str(error), "trusted": False, "reasons": []}
     found: Record = plain(
         {
             "refused": None,
@@ -124,10 +127,10 @@ def plan_capture(setting: Setting, chosen: Sequence[Procedure], stores: Stores, 
 def success_rates(rows: pd.DataFrame) -> dict[str, list[tuple[float, Rate]]]:
     """(offset, rate of success) at every level of every sweep; each begins with the starts at the truth.
 
-    Success: the pelvis within 10 mm and 2° of the truth. Runs that a defect has ended are left out. Several starts on
-    one procedure are not independent.
+    Success: the pelvis within 10 mm and 2° of the truth; a start that is refused is none. Runs that a defect has ended
+    are left out. Several starts on one procedure are not independent.
     """
-    done = rows[rows["status"].eq(DONE)]
+    done = rows[rows["status"].isin((DONE, REFUSED))]
     share, sweep = done[f"{VARIED}share"], done[f"{VARIED}sweep"]
     good = done[f"{PELVIS}_mm"].le(SUCCESS_MM) & done[f"{PELVIS}_deg"].le(SUCCESS_DEG)
     rates: dict[str, list[tuple[float, Rate]]] = {}

@@ -60,10 +60,11 @@ def test_success_needs_both_place_and_rotation() -> None:
         ("done", "rotation", 0.2, 10.1, 0.1),
         ("done", "depth", 0.2, 0.1, 2.1),
         ("failed", "depth", 0.2, np.nan, np.nan),
+        ("refused", "depth", 0.2, np.nan, np.nan),
     ]
-    rates = success_rates(capture_rows(starts, [1, 1, 2, 1, 2]))
+    rates = success_rates(capture_rows(starts, [1, 1, 2, 1, 2, 3]))
     assert rates["rotation"] == [(0.0, Rate(1, 1)), (pytest.approx(6.0), Rate(1, 2))]
-    assert rates["depth"] == [(0.0, Rate(1, 1)), (pytest.approx(20.0), Rate(0, 1))]
+    assert rates["depth"] == [(0.0, Rate(1, 1)), (pytest.approx(20.0), Rate(0, 2))]
     assert rates["jointly"] == [(0.0, Rate(1, 1))]
     assert max(LEVELS) == 1
 

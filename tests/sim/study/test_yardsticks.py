@@ -5,12 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from cheap_study import Cheap, study
 from coarse import PROCEDURE, SIMULATION, stores_in
 
+from femoreg_torch.errors import InputError
 from femoreg_torch.files import write_json
-from femoreg_torch.registration.plan import plan_from
+from femoreg_torch.registration.plan import Plan, plan_from
+from femoreg_torch.registration.scene import Scene
+from femoreg_torch.registration.workflow import Outcome
 from femoreg_torch.statistics.rows import read_rows
+from femoreg_torch.statistics.summary import Rate
 from sim.study import __main__ as command
 from sim.study.capture import plan_capture, success_rates, write_capture
 from sim.study.conditions import Imaged, body_of, made_once
@@ -129,3 +134,23 @@ def test_starts_at_the_truth_and_off_it_are_runs_of_a_study(coarse_root: Path, t
     counts: list[tuple[int, int, int]] = []
     run_study(plan, out, OnThisMachine(1), begin=lambda *told: counts.append(told))
     assert counts == [(0, 21, 0)]
+
+
+def test_a_start_from_which_a_plan_cannot_run_is_refused_and_no_defect(
+    coarse_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuses(scene: Scene, plan: Plan, start: torch.Tensor, seed: int, *_: object) -> Outcome:
+        counted.append(seed)
+        if len(counted) > 1:
+            raise InputError("view 1, anatomy image: weights [silhouette] leave no pixel to compare.")
+        return Outcome(scene, scene.start(start), (), ())  # the first, from the truth, stays there
+
+    counted: list[int] = []
+    monkeypatch.setattr("sim.study.capture.run_plan", refuses)
+    protocol = replace(load_protocol("accuracy"), simulation=str(coarse_root / SIMULATION))
+    (setting,) = settings_of(protocol, "accuracy").values()
+    stores, imaged = stores_in(coarse_root), Imaged(None, tmp_path / "conditions")
+    plan = plan_capture(setting, [PROCEDURE], stores, imaged, starts=1)
+    assert run_study(plan, tmp_path / "capture", OnThisMachine(1)).status == {"done": 1, "refused": 20}
+    rates = success_rates(read_rows(tmp_path / "capture" / TABLE_NAME))
+    assert rates["depth"] == [(20.0 * n, Rate(int(n == 0), 1)) for n in range(6)]
