@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
 from torch import Tensor
 
 from femoreg_torch.fluoro.intensity import downsample
@@ -67,9 +68,14 @@ def exposed_field(raw: Tensor, camera: Camera) -> Tensor | None:
 
 def without_penumbra(exposed: Tensor, camera: Camera) -> Tensor:
     """A mask (H, W) less a margin of 2.5 mm along its edge; the detector's border is no edge."""
-    inside = exposed.numpy().astype(np.uint8)
-    apart = torch.from_numpy(cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))  # of the nearest pixel
-    return exposed & ((apart - 0.5) * camera.mean_pixel_mm >= MARGIN_MM)
+    if bool(exposed.all()):
+        return exposed
+    to_edge = ndimage.distance_transform_edt(
+        exposed.numpy(), camera.pixel_mm, return_distances=False, return_indices=True
+    )
+    steps = np.abs(to_edge - np.indices(exposed.shape)) - 0.5  # to where the nearest pixel that is dark begins
+    apart = np.hypot(*(steps.clip(0) * np.array(camera.pixel_mm)[:, None, None]))
+    return exposed & torch.from_numpy(apart >= MARGIN_MM)
 
 
 def find_shutter(raw: Tensor, camera: Camera) -> Shutter | None:

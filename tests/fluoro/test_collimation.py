@@ -214,6 +214,18 @@ def test_a_margin_is_taken_off_along_the_edge_and_not_along_the_border() -> None
     assert torch.equal(kept, (199.5 - COLUMN) * 0.776 >= 2.5)
 
 
+@pytest.mark.parametrize("pixel_mm", [(0.2, 0.2), (0.4, 0.2), (0.2, 0.4)])
+def test_the_margin_is_as_wide_along_both_sides_of_a_pixel(pixel_mm: tuple[float, float]) -> None:
+    """2.5 mm and less than a pixel more, of a rectangle whose edges lie half a pixel before its first pixels."""
+    exposed = torch.zeros(200, 200, dtype=torch.bool)
+    exposed[50:150, 50:150] = True
+    kept = without_penumbra(exposed, centred_camera(1000.0, pixel_mm, (200, 200)))
+    for axis, mm in enumerate(pixel_mm):
+        lines = kept.any(1 - axis).nonzero()
+        for margin in ((int(lines[0]) + 0.5 - 50) * mm, (150 - 0.5 - int(lines[-1])) * mm):
+            assert 2.5 - 1e-9 <= margin < 2.5 + mm
+
+
 def test_the_open_beam_is_looked_for_within_the_field() -> None:
     raw = torch.full((60, 60), 1000.0)
     raw[:, 40:] = 60000.0  # letters burnt into the shadow
