@@ -1,7 +1,7 @@
 """A patient taken apart for imaging after one femur has turned: the bone moves rigidly, the soft tissue bends."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -28,7 +28,13 @@ class PosedTissue:
 
     def to(self, device: torch.device) -> "PosedTissue":
         """The same with its densities on a device."""
-        return PosedTissue(self.filled.to(device), self.bone.to(device), self.femur.to(device), self.lps_from_femur)
+        return replace(
+            self,
+            filled=self.filled.to(device),
+            bone=self.bone.to(device),
+            femur=self.femur.to(device),
+            apart=tuple(bone.to(device) for bone in self.apart),
+        )
 
 
 def take_apart(

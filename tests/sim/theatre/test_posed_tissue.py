@@ -108,3 +108,13 @@ def test_the_femur_is_found_where_the_turn_takes_it(hip):
 def test_a_label_map_without_the_femur_is_refused(hip):
     with pytest.raises(InputError, match=str(OTHER_ID)):
         take_apart(*hip, (OTHER_ID,), TURN, HEAD)
+
+
+def test_tissue_on_a_device_keeps_the_bones_that_are_held_apart(hip):
+    tissue = take_apart(*hip, (FEMUR_ID,), STILL, HEAD, apart=[(HIP_ID,)])
+    moved = tissue.to(torch.device("meta"))  # a device without memory
+    assert len(moved.apart) == len(tissue.apart) == 1
+    assert moved.apart[0].data.shape == tissue.apart[0].data.shape
+    volumes = (moved.filled, moved.bone, moved.femur, *moved.apart)
+    assert {volume.data.device.type for volume in volumes} == {"meta"}
+    assert torch.equal(moved.lps_from_femur, tissue.lps_from_femur)
