@@ -191,7 +191,9 @@ def _frame(mask: Mask, affine: Array, head: Array, side: Side, shaft_mm: float) 
     if any(n < 0 or n >= size for n, size in zip(nearest, mask.shape, strict=True)) or not mask[nearest]:
         raise InputError(f"landmarks: the centre of the {side} femoral head does not lie in the label of that femur.")
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
-    radius = float(ndimage.distance_transform_edt(mask, sampling=spacing)[nearest])
+    offsets = [(np.arange(size) - at) * edge for size, at, edge in zip(mask.shape, index, spacing, strict=True)]
+    squared = sum(along**2 for along in np.ix_(*offsets))  # mm², of all voxels from the centre itself, not its voxel
+    radius = float(np.sqrt(np.min(squared, where=~mask, initial=np.inf)))
     points = np.argwhere(mask) @ affine[:3, :3].T + affine[:3, 3] - head
     proximal = affine[:3, 2] / spacing[2]
     for _ in range(5):  # slices square to the axis follow from the axis

@@ -67,6 +67,24 @@ def test_the_frame_is_that_of_the_solids(femur: Femur) -> None:
     assert frame.head_radius == pytest.approx(22, abs=1.5)
 
 
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 3.0), (2.0, 2.0, 2.0)])
+def test_the_radius_of_the_head_is_that_of_its_sphere_wherever_its_centre_lies(
+    spacing: tuple[float, float, float],
+) -> None:
+    """A voxel belongs to the bone where its middle lies in a sphere, a shaft, or the neck between them."""
+    shape = [round(size / edge) for size, edge in zip((150, 110, 260), spacing, strict=True)]
+    points = np.moveaxis(np.indices(shape), 0, -1) * np.array(spacing)
+    head, below = np.array([110.3, 55.2, 210.4]), np.array([60.0, 55.0, 175.0])
+    share = np.clip((points - head) @ (below - head) / ((below - head) ** 2).sum(), 0, 1)
+    mask = np.linalg.norm(points - head - share[..., None] * (below - head), axis=-1) < 13
+    mask |= (np.hypot(points[..., 0] - 60, points[..., 1] - 55) < 15) & (points[..., 2] < 190)
+    mask |= np.linalg.norm(points - head, axis=-1) <= 24
+    affine = torch.diag(torch.tensor([*spacing, 1.0], dtype=torch.float64))
+    volume = Volume(torch.from_numpy(mask.transpose(2, 1, 0).astype(np.float32)), affine)
+    found = cut_out(volume, volume, 1, head, "right", 95.0)
+    assert found.frame.head_radius == pytest.approx(24, abs=0.1)
+
+
 def test_blocks_average_every_voxel_alike(femur: Femur) -> None:
     whole = tuple(n // 3 * 3 for n in femur.mask.shape)
     cut = dataclasses.replace(femur, mask=femur.mask[: whole[0], : whole[1], : whole[2]])
