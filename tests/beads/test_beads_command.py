@@ -251,6 +251,19 @@ def test_images_of_two_kinds_may_have_one_name(folder: Path, tmp_path: Path) -> 
     assert read_json(out / "truth_uncertainty.json")["deviations"]["device"]["mm"] < 0.3  # 0.7 by the other images
 
 
+def test_pixels_that_make_ellipses_of_beads_are_told(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With pixels of 0.25 × 0.2 mm one of three beads was found, and the others told to be missing."""
+    content = yaml.safe_load((folder / "case.yaml").read_text(encoding="utf-8"))
+    content["carm"]["pixel_mm"] = [0.35, 0.28]
+    (folder / "case.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    out = tmp_path / "trials" / "I"
+    assert main(["beads", str(folder), "--beads", str(folder / "beads.yaml"), "--out", str(out)]) == 2
+    assert "case.yaml, carm: its pixels are 0.35 × 0.28 mm. Shadows of beads are taken" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_the_case_itself_is_not_written_and_is_told_before_it_is_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
