@@ -191,7 +191,7 @@ def _sciatic_notch(hip: trimesh.Trimesh, frame: Points, middle: Points, edge_mm:
     largest = (0, 0)
     for part in range(1, count + 1):
         pixels = np.argwhere(parts == part)
-        back, up = pixels.mean(0) * _PIXEL_MM + origin
+        back, up = pixels.mean(0) * _PIXEL_MM + origin + _PIXEL_MM / 2
         if back > 0 and up > -25:
             largest = max(largest, (len(pixels), part))
     if not largest[1]:
@@ -199,5 +199,5 @@ def _sciatic_notch(hip: trimesh.Trimesh, frame: Points, middle: Points, edge_mm:
     bay = parts == largest[1]
     from_mouth = ndimage.distance_transform_edt(~(bay & ndimage.binary_dilation(~hull)))
     edge = bay & ndimage.binary_dilation(image)
-    place = np.argwhere(edge)[from_mouth[edge].argmax()] * _PIXEL_MM + origin
+    place = np.argwhere(edge)[from_mouth[edge].argmax()] * _PIXEL_MM + origin + _PIXEL_MM / 2
     return vertex_behind(hip, points2, place, 1.5)
