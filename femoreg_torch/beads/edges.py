@@ -19,7 +19,7 @@ from torch import Tensor
 
 from femoreg_torch.beads.bundle import Sight
 from femoreg_torch.beads.model import Beads
-from femoreg_torch.beads.spots import BLUR_PX, disc, quadratic, shadow, window_px
+from femoreg_torch.beads.spots import blur_on, disc, quadratic, shadow, window_px
 from femoreg_torch.case import Case, Model
 from femoreg_torch.geometry import Camera, Poses, transform_points
 from femoreg_torch.volume import read_bodies, read_mesh
@@ -142,7 +142,8 @@ def measured_again(
     there, the centre stays as it is. The deviation along each axis is that of the fit's residuals. None where the
     window leaves the image.
     """
-    half = window_px(radius_px)
+    blur_px = blur_on(camera.mean_pixel_mm)
+    half = window_px(radius_px, blur_px)
     column, row = round(pixel[0]), round(pixel[1])
     if not (half <= column < image.shape[1] - half and half <= row < image.shape[0] - half):
         return None
@@ -150,14 +151,14 @@ def measured_again(
     u, v = columns[inside], rows[inside]
     values = image[row - half : row + half + 1, column - half : column + half + 1][inside]
     around = quadratic(u, v, half)
-    drawn = sum((_drawn(part, camera, column, row, half)[inside] for part in metal), np.zeros(len(u)))
+    drawn = sum((_drawn(part, camera, column, row, half, blur_px)[inside] for part in metal), np.zeros(len(u)))
 
     def plain(parameters: Array) -> Array:
-        bead = shadow(radius_px, np.hypot(u - parameters[0], v - parameters[1]))
+        bead = shadow(radius_px, np.hypot(u - parameters[0], v - parameters[1]), blur_px)
         return _left(values, np.column_stack([bead, around]))
 
     def beside(parameters: Array) -> Array:
-        bead = diameter_mm * shadow(radius_px, np.hypot(u - parameters[0], v - parameters[1]))
+        bead = diameter_mm * shadow(radius_px, np.hypot(u - parameters[0], v - parameters[1]), blur_px)
         total = drawn + parameters[2] * bead
         return _left(values, np.column_stack([total, total**2, around]))
 
@@ -183,7 +184,7 @@ def _deviation(jacobian: Array, left: Array, free: int) -> float:
     return float(np.sqrt(covariance.diagonal()[:2].mean()))
 
 
-def _drawn(metal: Metal, camera: Camera, column: int, row: int, half: int) -> Array:
+def _drawn(metal: Metal, camera: Camera, column: int, row: int, half: int, blur_px: float) -> Array:
     """Metal in the beam, mm, of a window (2 · half + 1)² about a pixel, blurred as the detector does."""
     reach = half + _ASIDE_PX
     offsets = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
@@ -191,4 +192,4 @@ def _drawn(metal: Metal, camera: Camera, column: int, row: int, half: int) -> Ar
     rows, columns = np.meshgrid(line + row, line + column, indexing="ij")
     fine = in_beam(metal, camera, columns.ravel(), rows.ravel())
     mean = fine.reshape(2 * reach + 1, _PARTS, 2 * reach + 1, _PARTS).mean((1, 3))
-    return np.asarray(ndimage.gaussian_filter(mean, BLUR_PX)[_ASIDE_PX:-_ASIDE_PX, _ASIDE_PX:-_ASIDE_PX])
+    return np.asarray(ndimage.gaussian_filter(mean, blur_px)[_ASIDE_PX:-_ASIDE_PX, _ASIDE_PX:-_ASIDE_PX])

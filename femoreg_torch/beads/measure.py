@@ -16,7 +16,7 @@ from femoreg_torch.beads.edges import beside_metal, read_metal
 from femoreg_torch.beads.given import Given, Mark
 from femoreg_torch.beads.matching import Match, match_beads
 from femoreg_torch.beads.model import Beads
-from femoreg_torch.beads.spots import find_spots
+from femoreg_torch.beads.spots import blur_on, find_spots
 from femoreg_torch.case import Case
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
@@ -180,7 +180,7 @@ class _Matcher:
         if rough is not None:
             depth = float(transform_points(rough, thing.points)[:, 2].mean())
         radius = thing.diameter_mm / 2 * self.camera.sdd_mm / depth / self.camera.mean_pixel_mm
-        pixels = find_spots(image, radius, field).pixels
+        pixels = find_spots(image, radius, field, blur_on(self.camera.mean_pixel_mm)).pixels
         return pixels[~self._taken(thing, view, pixels)], None
 
     def _taken(self, thing: Beads, view: int, pixels: Tensor) -> Tensor:

@@ -22,7 +22,8 @@ from femoreg_torch.errors import InputError
 
 Array = NDArray[np.float64]
 
-BLUR_PX = 0.9  # standard deviation of detector and pixel together; a caesium iodide panel's scintillator has 0.15 mm
+BLUR_PX = 0.9  # standard deviation of detector and pixel together, on pixels of 0.18 mm; on others see `blur_on`
+_SCINTILLATOR_MM = 0.15  # standard deviation of the blur of a caesium iodide panel
 _MARGIN_PX = 3.0  # of the window beside three radii of blur
 _WINDOW_RADII = 2.0
 _SEEN = 0.55  # least correlation of a window with the shadow, after the surface, for a candidate
@@ -51,6 +52,11 @@ class Spots:
     def chosen(self, which: Tensor) -> "Spots":
         """Those of an index or mask."""
         return Spots(*(values[which] for values in vars(self).values()))
+
+
+def blur_on(pixel_mm: float) -> float:
+    """Standard deviation, px, of a scintillator's blur and the average over a pixel of `pixel_mm` together."""
+    return float(np.hypot(_SCINTILLATOR_MM / pixel_mm, 1 / np.sqrt(12)))
 
 
 def shadow(radius_px: float, distance_px: Array, blur_px: float = BLUR_PX) -> Array:

@@ -7,7 +7,7 @@ from bead_scenes import disc_image
 from scipy import integrate, ndimage
 
 from femoreg_torch.beads import find_spots
-from femoreg_torch.beads.spots import shadow
+from femoreg_torch.beads.spots import blur_on, shadow
 from femoreg_torch.errors import InputError
 
 CENTRES = torch.tensor([[60.3, 70.8], [130.0, 55.5], [221.7, 172.2], [90.45, 190.1], [250.6, 215.9]]).double()
@@ -71,3 +71,17 @@ def test_wrong_units_are_told_in_one_line(radius_px: float) -> None:
     with pytest.raises(InputError, match="in mm") as caught:
         find_spots(torch.zeros(50, 50), radius_px)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("pixel_mm", [0.1, 0.194, 0.3, 0.388])
+def test_a_bead_behind_one_scintillator_is_found_on_pixels_of_any_size(pixel_mm: float) -> None:
+    """A shadow of 0.8 mm radius, drawn six times as fine as the pixels and blurred by 0.15 mm, in noise of 1 %."""
+    count, parts, radius_mm = 60, 6, 0.8
+    line = (np.arange(count * parts) + 0.5) / parts - 0.5
+    apart = np.hypot(*np.meshgrid(line - 30.3, line - 28.6)) * pixel_mm / radius_mm
+    fine = ndimage.gaussian_filter(np.sqrt(np.clip(1 - apart**2, 0, None)), 0.15 / pixel_mm * parts)
+    image = 0.8 * fine.reshape(count, parts, count, parts).mean((1, 3))
+    image += np.random.default_rng(2).normal(0, 0.01, image.shape)
+    found = find_spots(torch.from_numpy(image), radius_mm / pixel_mm, None, blur_on(pixel_mm))
+    np.testing.assert_allclose(found.pixels[:1].numpy(), [[30.3, 28.6]], atol=0.05)
+    assert float(found.radii_px[0]) * pixel_mm == pytest.approx(radius_mm, rel=0.05)
