@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from femoreg_torch.case import Start
+from femoreg_torch.case import Start, anchor_of
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import (
     Camera,
@@ -172,10 +172,9 @@ class Scene:
         In its space lie the landmarks and the soft tissue, which a model's space has nothing to do with. What no image
         shows has no pose, and others come before it.
         """
-        placed = [name for name, thing in self.objects.items() if thing.start.by_landmarks]
         shown = [name for name, thing in self.objects.items() if self.there(thing.shown_in, range(self.views))]
-        bones = [name for name in shown if not self.objects[name].parts]
-        return next(iter([*placed, *bones, *shown, *self.objects]))
+        bones = [name for name, thing in self.objects.items() if not thing.parts]
+        return anchor_of(shown, {name: thing.start for name, thing in self.objects.items()}, bones)
 
     @property
     def needs_landmarks(self) -> bool:

@@ -16,6 +16,9 @@ _AROUND_MM = 6.0  # of the guide's line: thinner than most handles and arms besi
 _LOOKED_AT_MM = -40.0, 15.0  # along the guide from the tip: a drill may stand out of a sleeve whose model lacks it
 _END_MM = 8.0  # of the model: the slanted end of a needle is shorter, and its tip lies on one side
 _DIRECTIONS = 72
+_SLICES_MM, _SLICE_MM = (-40, -8, 4), 4.0  # whose middles tell the axis: not those of a slanted or pointed end
+_SLENDER_MM = 8.0  # of the radius of these: a plate or a handle has no axis that the guide must be
+_STRAIGHT_MM = 0.4  # of these middles from one line
 _WIDEST_MM = 15.0  # from the guide's line: a plate or a handle is no end of a guide
 
 
@@ -26,6 +29,7 @@ class GuideEnd:
     beyond_mm: float  # of the tip, along the guide, past the last of the model; negative: before it
     off_middle_mm: float  # of the guide's line, from the middle of the model's last 8 mm
     aside_mm: float  # of the guide's line, beside all that these 8 mm hold; 0 where the line runs through them
+    leaning_deg: float  # of the guide's line, from the axis of the model's last 40 mm; nan where these have no axis
 
 
 def guide_end(volume: Volume, base: Tensor, tip: Tensor) -> GuideEnd | None:
@@ -51,7 +55,33 @@ def guide_end(volume: Volume, base: Tensor, tip: Tensor) -> GuideEnd | None:
     directions = torch.stack([turns.cos(), turns.sin()], 1)
     gap = float((beside @ directions.T).amin(0).max())  # to the convex hull of what the end holds
     middle = _whole(end, beside, 4 * half_mm).mean(0)  # no gaps within a piece
-    return GuideEnd(-(last + half_mm), float(middle.norm()), max(0.0, gap - half_mm))
+    leaning = _leaning_deg(along - last, aside, 4 * half_mm)
+    return GuideEnd(-(last + half_mm), float(middle.norm()), max(0.0, gap - half_mm), leaning)
+
+
+def _leaning_deg(before: Tensor, aside: Tensor, cell_mm: float) -> float:
+    """The angle between the guide's line and the model's axis there, of places by mm `before` (N,) and `aside` (N, 2).
+
+    The axis is the straight line through the middles of cross-sections that are slender and all round about one line;
+    nan where there is none, as beside a handle.
+    """
+    steps, middles = [], []
+    for start in range(*_SLICES_MM):
+        slab = aside[(before > start) & (before <= start + _SLICE_MM)]
+        beside = slab[slab.norm(dim=1) < _AROUND_MM]
+        if not len(beside):
+            return math.nan
+        piece = _whole(slab, beside, cell_mm)
+        middle = (piece.amin(0) + piece.amax(0)) / 2
+        if float((piece - middle).norm(dim=1).max()) > _SLENDER_MM:
+            return math.nan
+        steps.append(start + _SLICE_MM / 2)
+        middles.append(middle)
+    found = torch.stack(middles)
+    terms = torch.stack([torch.ones(len(steps)), torch.tensor(steps)], 1).to(found)
+    fit = torch.linalg.lstsq(terms, found).solution
+    off = float((found - terms @ fit).norm(dim=1).max())
+    return math.degrees(math.atan(float(fit[1].norm()))) if off < _STRAIGHT_MM else math.nan
 
 
 def _whole(end: Tensor, beside: Tensor, cell_mm: float) -> Tensor:

@@ -248,5 +248,5 @@ def check_inside(landmarks: Mapping[str, Tensor], volume: Volume) -> None:
             position = ", ".join(f"{v:.1f}" for v in point.tolist())
             raise InputError(
                 f"landmark {_told(name)} at ({position}) mm LPS lies outside the CT. Check for RAS/LPS mix-ups, or "
-                "that both files are of the same scan."
+                "that both files are of the same scan; if the CT was cropped, take the landmark out of its file."
             )

@@ -1,5 +1,6 @@
 """A device whose model has another length or size than the one in the images is told from one that is right."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -193,6 +194,15 @@ def test_a_guide_that_passes_beside_its_model_is_doubted(scene: Scene, aside_mm:
     doubts = doubts_about_told_tips(replace(CASE, objects={"device": device}), scene)
     assert len(doubts) == told
     assert all("beside the middle of its model's end" in doubt for doubt in doubts)
+
+
+@pytest.mark.parametrize(("deg", "told"), [(0, False), (1, False), (3, True)])
+def test_a_guide_that_leans_against_its_model_is_doubted(scene: Scene, deg: float, told: bool) -> None:
+    away = float64(0, float((BASE - TIP).norm()) * math.tan(math.radians(deg)), 0)
+    device = CaseObject("device", model=Model(Path("device.stl"), 5000.0), points={"base": BASE + away, "tip": TIP})
+    doubts = doubts_about_told_tips(replace(CASE, objects={"device": device}), scene)
+    assert len(doubts) == told
+    assert all("leans by 3° against the axis" in doubt for doubt in doubts)
 
 
 def test_an_image_that_is_saturated_as_a_whole_is_no_error(scene: Scene) -> None:

@@ -84,3 +84,28 @@ def test_what_stands_beside_a_guide_is_no_end_of_it() -> None:
     assert end is not None
     assert end.beyond_mm == pytest.approx(0, abs=0.5)
     assert guide_end(voxels(pin), BASE, TIP) is None
+
+
+@pytest.mark.parametrize("radius", [0.8, 2.0, 5.0])
+@pytest.mark.parametrize("deg", [0.0, 2.0, 4.0])
+def test_a_line_that_leans_is_told_by_its_angle(radius: float, deg: float) -> None:
+    """A rod that was turned about its end against the points that are told of it, thick and thin."""
+    turned = torch.tensor([math.sin(math.radians(deg)), 0, math.cos(math.radians(deg))], dtype=torch.float64)
+    end = guide_end(voxels(needle(radius, 100 * turned)), BASE, TIP)
+    assert end is not None
+    assert end.leaning_deg == pytest.approx(deg, abs=0.4)
+
+
+def test_a_plate_a_hook_and_a_cone_do_not_lean() -> None:
+    """A plate beside the guide, an end that is not straight, and sides that lean about a middle that does not."""
+    plate = trimesh.creation.box((60, 4, 60), trimesh.transformations.translation_matrix([20, 0, 40]))
+    hook = trimesh.creation.cylinder(2.0, segment=[[0, 0, 14], [5, 0, 22]])
+    back = trimesh.creation.cylinder(2.0, segment=[[5, 0, 22], [0, 0, 40]])
+    straight = trimesh.creation.cylinder(2.0, segment=[[0, 0, 0], [0, 0, 14]])
+    cone = trimesh.creation.cone(7.0, 60, transform=trimesh.transformations.rotation_matrix(math.pi, [1, 0, 0]))
+    cone.apply_translation([0, 0, 60])
+    models = voxels(needle(), plate), voxels(cone), voxels(straight, hook, back)
+    ends = [guide_end(model, BASE, TIP) for model in models]
+    leaning = [end.leaning_deg for end in ends if end is not None]
+    assert leaning[:2] == pytest.approx([0, 0], abs=0.3)
+    assert math.isnan(leaning[2])
