@@ -14,9 +14,11 @@ from torch import Tensor
 
 from femoreg_torch.beads.bundle import Bundle
 from femoreg_torch.evaluation import ReferencePoints
-from femoreg_torch.evaluation.errors import PAPER_FROM_CAMERA
+from femoreg_torch.evaluation.errors import paper_from_camera
 from femoreg_torch.geometry import Poses, invert_rigid, transform_points
 from femoreg_torch.geometry.rigid import skew
+
+_PAPER_FROM_CAMERA = paper_from_camera("anterior")  # images of another source are refused
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +56,8 @@ def object_rows(sure: Uncertainty) -> dict[str, dict[str, Any]]:
     """Standard deviations of every object: `{mm, deg, mm_xyz, deg_xyz}`, total and along IS, LR, AP of view 1."""
     rows = {}
     for name in sure.objects:
-        turned = PAPER_FROM_CAMERA @ sure.of(name)[:3, :3] @ PAPER_FROM_CAMERA.T
-        shifted = PAPER_FROM_CAMERA @ sure.of(name)[3:, 3:] @ PAPER_FROM_CAMERA.T
+        turned = _PAPER_FROM_CAMERA @ sure.of(name)[:3, :3] @ _PAPER_FROM_CAMERA.T
+        shifted = _PAPER_FROM_CAMERA @ sure.of(name)[3:, 3:] @ _PAPER_FROM_CAMERA.T
         rows[name] = {
             "mm": float(shifted.trace().sqrt()),
             "deg": math.degrees(float(turned.trace().sqrt())),
@@ -72,7 +74,7 @@ def view_rows(found: Bundle) -> dict[str, dict[str, Any]]:
     for number in range(1, len(found.poses.camera_from_camera1)):
         at = 6 * (known + number - 1)
         covariance = found.covariance[at : at + 6, at : at + 6]
-        turn = PAPER_FROM_CAMERA @ invert_rigid(found.poses.camera_from_camera1[number])[:3, :3]
+        turn = _PAPER_FROM_CAMERA @ invert_rigid(found.poses.camera_from_camera1[number])[:3, :3]
         about_source = _moved(-found.centres[known + number - 1])
         covariance = about_source @ covariance @ about_source.T
         turned, shifted = (turn @ block @ turn.T for block in (covariance[:3, :3], covariance[3:, 3:]))

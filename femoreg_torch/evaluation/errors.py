@@ -2,8 +2,9 @@
 
 Gao et al., Fiducial-free 2D/3D registration for robot-assisted femoroplasty, IEEE Trans Med Robot Bionics 2 (2020) 437.
 
-Differences are taken in the camera frame of view 1 and told along the paper's axes: x = IS towards the head (camera
-−y), y = LR towards the patient's left (camera +x), z = AP towards the back, the depth (camera +z): a right-handed set.
+Differences are taken in the camera frame of view 1 and told along the paper's axes: x = IS towards the head, y = LR
+towards the patient's left, z = AP towards the back: a right-handed set. They are the axes of that camera, named by the
+side that its source stands on (`paper_from_camera`), so they lie as obliquely to the patient as view 1 does.
 """
 
 import math
@@ -15,20 +16,37 @@ from torch import Tensor
 
 from femoreg_torch.case import Case, PlannedPath
 from femoreg_torch.errors import InputError
+from femoreg_torch.fluoro.display import Display, Source
 from femoreg_torch.geometry import Poses, euler_xyz_deg, invert_rigid, rotation_angle, transform_points
 from femoreg_torch.registration.prepare import read_bones, reference_point
 from femoreg_torch.registration.scene import Scene
 
-PAPER_FROM_CAMERA = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+
+def paper_from_camera(source: Source) -> Tensor:
+    """The rotation (3, 3), float64, from camera 1 to IS, LR and AP, its source on this side of the patient.
+
+    Camera 1 sees the patient head up: its −y is IS. Its z is the beam: AP from the front, −AP from behind, LR from the
+    right, −LR from the left. Its x is square to both.
+    """
+    beam = torch.tensor(Display(source).beam, dtype=torch.float64)
+    head = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    camera_from_lps = torch.stack([torch.linalg.cross(beam, head), -head, beam])
+    return camera_from_lps.T[[2, 0, 1]] + 0.0  # no −0.0
 
 
 @dataclass(frozen=True, eq=False)
 class ReferencePoints:
-    """Where errors are told, mm in the space of each object."""
+    """Where errors are told, mm in the space of each object, and along which axes."""
 
     objects: dict[str, Tensor]  # (3,) of every object
     plan: PlannedPath | None = None
     guide: tuple[Tensor, Tensor] | None = None  # base and tip (3,) of the plan's tool
+    source: Source = "anterior"  # the side of the patient that the source of view 1 stands on
+
+    @property
+    def paper_from_camera(self) -> Tensor:
+        """From the frame of camera 1 to IS, LR and AP, (3, 3)."""
+        return paper_from_camera(self.source)
 
 
 def reference_points(case: Case, scene: Scene | None = None) -> ReferencePoints:
@@ -47,7 +65,8 @@ def reference_points(case: Case, scene: Scene | None = None) -> ReferencePoints:
     if case.plan is not None and case.plan.tool is not None:
         points = case.objects[case.plan.tool].points
         guide = points["base"], points["tip"]
-    return ReferencePoints(objects, case.plan, guide)
+    display = case.display_of(0) if case.views else case.display
+    return ReferencePoints(objects, case.plan, guide, display.source)
 
 
 def errors(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, Any]:
@@ -66,12 +85,14 @@ def errors(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, 
         raise InputError(
             f"errors: the truth has {counts[0]} views, the estimate {counts[1]}. Are they of the same case?"
         )
-    there, here = truth.camera1_from, estimate.camera1_from
-    rows: dict[str, Any] = {name: _row(there[name], here[name], points.objects[name]) for name in there if name in here}
+    there, here, axes = truth.camera1_from, estimate.camera1_from, points.paper_from_camera
+    rows: dict[str, Any] = {
+        name: _row(there[name], here[name], points.objects[name], axes) for name in there if name in here
+    }
     source = torch.zeros(3, dtype=torch.float64)
     cameras = zip(truth.camera_from_camera1[1:], estimate.camera_from_camera1[1:], strict=True)
     for number, (true_camera, camera) in enumerate(cameras, 2):
-        rows[f"view{number}"] = _row(invert_rigid(true_camera), invert_rigid(camera), source)
+        rows[f"view{number}"] = _row(invert_rigid(true_camera), invert_rigid(camera), source, axes)
     return rows | _path_errors(there, here, points)
 
 
@@ -84,7 +105,7 @@ def path_displacements(truth: Poses, estimate: Poses, points: ReferencePoints) -
             found["tip"] = points.plan.tool, points.guide[1]
     there, here = truth.camera1_from, estimate.camera1_from
     return {
-        key: PAPER_FROM_CAMERA @ _displacement(there[name], here[name], point)
+        key: points.paper_from_camera @ _displacement(there[name], here[name], point)
         for key, (name, point) in found.items()
         if name in there and name in here
     }
@@ -116,14 +137,14 @@ def _displacement(true_pose: Tensor, pose: Tensor, point: Tensor) -> Tensor:
     return (transform_points(pose, point[None]) - transform_points(true_pose, point[None]))[0]
 
 
-def _row(true_pose: Tensor, pose: Tensor, point: Tensor) -> dict[str, Any]:
+def _row(true_pose: Tensor, pose: Tensor, point: Tensor, axes: Tensor) -> dict[str, Any]:
     shift = _displacement(true_pose, pose, point)
     turn = pose[:3, :3] @ true_pose[:3, :3].T
     return {
         "mm": shift.norm().item(),
         "deg": math.degrees(rotation_angle(turn).item()),
-        "mm_xyz": (PAPER_FROM_CAMERA @ shift).tolist(),
-        "deg_xyz": euler_xyz_deg(PAPER_FROM_CAMERA @ turn @ PAPER_FROM_CAMERA.T).tolist(),
+        "mm_xyz": (axes @ shift).tolist(),
+        "deg_xyz": euler_xyz_deg(axes @ turn @ axes.T).tolist(),
     }
 
 

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.evaluation import ReferencePoints
-from femoreg_torch.evaluation.errors import PAPER_FROM_CAMERA
 from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.statistics.quantities import AXES
@@ -39,12 +38,12 @@ def error_responses(poses: Poses, points: ReferencePoints) -> dict[str, dict[str
     found: dict[str, dict[str, Tensor]] = {}
     middle, axes = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
     for name in here:
-        found |= _of_pose(name, name, _moves(middle), _turns(axes))
+        found |= _of_pose(name, name, _moves(middle), _turns(axes), points.paper_from_camera)
     anchor = next(iter(poses.camera1_from))
     for view in range(1, len(poses.camera_from_camera1)):
         back = -poses.camera_from_camera1[view, :3, :3].T  # the camera moves against what it sees
         shift, turn = back @ _moves(-centres_in(poses, points, view)[anchor]), back @ _turns(axes)
-        found |= _of_pose(view_block(view), view_block(view), shift, turn)
+        found |= _of_pose(view_block(view), view_block(view), shift, turn, points.paper_from_camera)
     return found | _of_path(poses, points, here)
 
 
@@ -65,11 +64,13 @@ def _of_path(poses: Poses, points: ReferencePoints, here: Mapping[str, Tensor]) 
     return found | {"tip_mm": tip, "relative_mm": relative, "guide_deg": {tool: _tilt(pose, end - base)}}
 
 
-def _of_pose(key: str, block: str, shift: Tensor, turn: Tensor) -> dict[str, dict[str, Tensor]]:
+def _of_pose(
+    key: str, block: str, shift: Tensor, turn: Tensor, paper_from_camera: Tensor
+) -> dict[str, dict[str, Tensor]]:
     """Totals and signed parts of displacements (3, 6) and turns (3, 6) in camera 1."""
     found = {}
     for unit, rows in (("mm", shift), ("deg", turn)):
-        told = PAPER_FROM_CAMERA @ rows
+        told = paper_from_camera @ rows
         found[f"{key}_{unit}"] = {block: told}
         found |= {f"{key}_{unit}_{axis}": {block: told[n : n + 1]} for n, axis in enumerate(AXES)}
     return found

@@ -8,13 +8,14 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from femoreg_torch.evaluation.errors import paper_from_camera
 from femoreg_torch.files import temporary_file
+from femoreg_torch.fluoro.display import Source
 from femoreg_torch.statistics.quantities import AXES
 from femoreg_torch.statistics.rows import IDENTITY, ROWS_NAME, checked_rows
 from sim.study.record import Record
 
 TABLE_NAME = ROWS_NAME
-_PER_AXIS = (1, 0, 2)  # errors are told along IS, LR and AP, deviations along the camera's x, y and z
 _DIFFERS = ("seconds_", "host", "version_")  # what may differ between two runs of the same study
 _LAST = ("evaluations_", "seconds_", "version_", "host")  # beginnings of the columns that stand at the end
 
@@ -41,12 +42,19 @@ def _of_round(record: Record) -> Row:
         row["pelvis_at_head_mm"] = record["pelvis_at_head_mm"]
     for point, shift in (record.get("displacements_mm") or {}).items():
         row |= {f"{point}_mm_{axis}": part for axis, part in zip(AXES, shift, strict=True)}
+    axes = _camera_axes(record.get("source", "anterior"))
     for name, quality in record.get("quality", {}).items():
         row[f"{name}_trusted"] = quality["trusted"]
         for unit, key in (("mm", "translation_deviation_mm"), ("deg", "rotation_deviation_deg")):
-            row |= {f"{name}_sigma_{unit}_{axis}": quality[key][n] for axis, n in zip(AXES, _PER_AXIS, strict=True)}
+            row |= {f"{name}_sigma_{unit}_{axis}": quality[key][n] for axis, n in zip(AXES, axes, strict=True)}
     row |= flat_stages(record.get("stages", ()))
     return row | {f"seconds_{key}": value for key, value in record.get("timings_s", {}).items()}
+
+
+def _camera_axes(source: Source) -> list[int]:
+    """Which axis of camera 1, along which deviations are told, is IS, LR and AP, along which errors are."""
+    found: list[int] = paper_from_camera(source).abs().argmax(1).tolist()
+    return found
 
 
 def flat_errors(errors: Mapping[str, Any], prefix: str = "") -> dict[str, float]:

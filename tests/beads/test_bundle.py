@@ -14,7 +14,7 @@ from femoreg_torch.beads.uncertainty import view_rows
 from femoreg_torch.case import PlannedPath
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation import ReferencePoints, errors
-from femoreg_torch.evaluation.errors import PAPER_FROM_CAMERA
+from femoreg_torch.evaluation.errors import paper_from_camera
 from femoreg_torch.geometry import Poses, about_point, exp_se3, invert_rigid, log_so3, project_points, transform_points
 
 ISOCENTRE = torch.tensor([0.0, 0.0, 632.0], dtype=torch.float64)
@@ -165,7 +165,7 @@ def test_rows_are_told_along_the_axes_of_the_paper() -> None:
     assert row["mm_xyz"][2] > 3 * max(row["mm_xyz"][:2])  # depth is what projection tells least
     assert row["mm"] == pytest.approx(np.linalg.norm(row["mm_xyz"]))
     camera_axes = sure.of("femur").diagonal()[3:].sqrt()
-    assert torch.tensor(row["mm_xyz"]) == pytest.approx((PAPER_FROM_CAMERA.abs() @ camera_axes).numpy())
+    assert torch.tensor(row["mm_xyz"]) == pytest.approx((paper_from_camera("anterior").abs() @ camera_axes).numpy())
 
 
 def test_views_are_as_sure_as_monte_carlo_says() -> None:

@@ -1,14 +1,17 @@
 """Equations 5 to 13 against numbers worked out by hand."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from femoreg_torch.case import PlannedPath
+from femoreg_torch.case import Case, PlannedPath, View
 from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation import ReferencePoints, errors
-from femoreg_torch.geometry import Poses, exp_so3, poses_by_object, rigid
+from femoreg_torch.evaluation import ReferencePoints, errors, path_displacements, reference_points
+from femoreg_torch.evaluation.errors import paper_from_camera
+from femoreg_torch.fluoro import Display
+from femoreg_torch.geometry import Camera, CArm, Poses, exp_so3, poses_by_object, rigid
 
 
 def vector(*values):
@@ -76,6 +79,43 @@ def test_shifts_along_the_camera_axes_land_in_lr_is_and_ap(truth, camera_shift, 
     assert found["entry_point_mm"] == pytest.approx(1)
     assert found["relative_mm"] == pytest.approx(1)
     assert found["tip_mm"] == pytest.approx(0, abs=1e-9)
+
+
+# camera 1 upright, by hand: its x, y and z (rows) in LPS; y runs to the feet, z away from the source
+UPRIGHT = {
+    "anterior": [[1.0, 0, 0], [0, 0, -1], [0, 1, 0]],  # the patient's left is on the right
+    "posterior": [[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]],  # the patient's left is on the left
+    "right": [[0.0, -1, 0], [0, 0, -1], [1, 0, 0]],  # the patient looks to the right
+    "left": [[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]],  # the patient looks to the left
+}
+
+
+@pytest.mark.parametrize("source", UPRIGHT)
+def test_is_lr_and_ap_are_the_patients_wherever_the_source_stands(source):
+    """1 mm to the head, 2 to the left, 3 to the back, and 2° about the axis to the left, in the patient's own axes."""
+    camera1_from_lps = rigid(torch.tensor(UPRIGHT[source], dtype=torch.float64), vector(0, 0, 700))
+    truth = Poses(torch.eye(4, dtype=torch.float64)[None], dict.fromkeys(POINTS.objects, camera1_from_lps))
+    points, head = replace(POINTS, source=source), POINTS.objects["femur"]
+    moved = truth.with_object("femur", camera1_from_lps @ rigid(translation=vector(2, 3, 1)))
+    assert errors(truth, moved, points)["femur"]["mm_xyz"] == pytest.approx([1, 2, 3])
+    assert path_displacements(truth, moved, points)["entry_point"].tolist() == pytest.approx([1, 2, 3])
+    turn = rigid(translation=head) @ rigid(exp_so3(vector(math.radians(2), 0, 0))) @ rigid(translation=-head)
+    turned = errors(truth, truth.with_object("femur", camera1_from_lps @ turn), points)["femur"]
+    assert turned["deg_xyz"] == pytest.approx([0, 2, 0], abs=1e-6)
+
+
+def test_axes_before_a_source_in_front_are_exact():
+    axes = paper_from_camera("anterior")
+    assert torch.equal(axes, torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64))
+    assert not torch.signbit(axes[axes == 0]).any()
+
+
+def test_the_first_view_tells_where_the_source_stands(tmp_path):
+    camera = Camera(1000.0, (0.5, 0.5), (8, 8), (3.5, 3.5))
+    case = Case(tmp_path, CArm(camera, (0.0, 0.0, 600.0), (0.0, 1.0, 0.0)), {}, display=Display("posterior"))
+    assert reference_points(case).source == "posterior"
+    views = (View({}, display=Display("left", mirrored=True)), View({}))
+    assert reference_points(replace(case, views=views)).source == "left"
 
 
 def test_a_rotation_about_the_head_moves_the_entry_point_by_the_chord(truth):

@@ -1,6 +1,7 @@
 """The Cramér–Rao bound: against closed forms, finite differences, and estimates from noisy images."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 from femoreg_torch.case import PlannedPath
 from femoreg_torch.drr import project, project_with_jacobian
 from femoreg_torch.evaluation import ReferencePoints, errors, path_displacements
+from femoreg_torch.fluoro.display import Source
 from femoreg_torch.geometry import Camera, CArm, Poses, about_point, centred_camera, exp_se3, rigid, transform_points
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.imaging import PLAIN, Imaging
@@ -192,8 +194,12 @@ def twisted(poses: Poses, points: ReferencePoints, block: str, twist: Tensor) ->
     return poses.with_view(view, motion @ poses.camera_from_camera1[view])
 
 
+@pytest.mark.parametrize("source", ["anterior", "left"])
 @pytest.mark.parametrize("block", POSES)
-def test_responses_are_what_the_evaluation_tells(poses: Poses, points: ReferencePoints, block: str) -> None:
+def test_responses_are_what_the_evaluation_tells(
+    poses: Poses, points: ReferencePoints, block: str, source: Source
+) -> None:
+    points = replace(points, source=source)
     generator = torch.Generator().manual_seed(5)
     twist = 1e-4 * torch.randn(6, generator=generator, dtype=torch.float64) * at(1, 1, 1, 50, 50, 50)
     there = twisted(poses, points, block, twist)

@@ -82,6 +82,13 @@ def test_deviations_lie_along_the_axes_of_the_errors(records: list[dict[str, Any
         assert [rate.share for rate in found["pelvis", unit].within_1] == pytest.approx((errors <= stated).mean(0))
 
 
+def test_deviations_of_a_view_from_a_side_have_lr_for_their_depth(records: list[dict[str, Any]]) -> None:
+    done = next(record for record in records if record["refused"] is None)
+    (row,) = rows_of(done | {"source": "left"})
+    x, y, z = done["quality"]["pelvis"]["translation_deviation_mm"]
+    assert [row[f"pelvis_sigma_mm_{axis}"] for axis in ("is", "lr", "ap")] == [y, z, x]
+
+
 def test_types_hold_what_all_rows_have(records: list[dict[str, Any]], tmp_path: Path) -> None:
     mixed = [records[0] | {"varied": {"dose": value}} for value in (5, "open", None)]
     assert table_of(mixed)["varied_dose"].to_pylist() == ["5", "open", None]
