@@ -136,8 +136,8 @@ def plan_robustness(
 
     Args:
         plan: Folder that `femoreg plan` wrote.
-        study: Folder with runs.parquet or runs.csv, with signed errors of entry point and tip (or femur and device)
-            along each axis, and of the turns.
+        study: Folder with runs.parquet or runs.csv, whose columns miss_mm_lr, … and miss_deg_lr, … tell by what the
+            tool would miss after its correction, as `femoreg study` writes them.
         covariance: In place of a study: a text file with 3 × 3 numbers (mm², LPS) or 6 × 6 (mm at the entry point, then
             degrees about it), or a result.json of `femoreg register`, which holds the covariance of its path.
         mean: With it, the mean of the errors, as [x, y, z] or six numbers; zeros if not given.

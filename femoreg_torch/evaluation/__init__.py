@@ -1,6 +1,6 @@
 """Errors against the truth, the paper's figures beside them, overlays, the report and the replay."""
 
-from femoreg_torch.evaluation.errors import ReferencePoints, errors, path_displacements, reference_points
+from femoreg_torch.evaluation.errors import ReferencePoints, errors, path_displacements, path_miss, reference_points
 from femoreg_torch.evaluation.overlay import overlay_figure
 from femoreg_torch.evaluation.replay import REPLAY_NAMES, write_replay
 from femoreg_torch.evaluation.run import EVALUATION_NAMES, evaluate, evaluation_page, write_report
@@ -18,6 +18,7 @@ __all__ = [
     "evaluation_page",
     "overlay_figure",
     "path_displacements",
+    "path_miss",
     "reference_points",
     "write_replay",
     "write_report",

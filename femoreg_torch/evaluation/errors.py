@@ -17,9 +17,11 @@ from torch import Tensor
 from femoreg_torch.case import Case, PlannedPath
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro.display import Display, Source
-from femoreg_torch.geometry import Poses, euler_xyz_deg, invert_rigid, rotation_angle, transform_points
+from femoreg_torch.geometry import Poses, euler_xyz_deg, invert_rigid, log_so3, rotation_angle, transform_points
 from femoreg_torch.registration.prepare import read_bones, reference_point
 from femoreg_torch.registration.scene import Scene
+
+_PAPER_FROM_LPS = [2, 0, 1]  # IS, LR and AP among left, back and head
 
 
 def paper_from_camera(source: Source) -> Tensor:
@@ -31,7 +33,7 @@ def paper_from_camera(source: Source) -> Tensor:
     beam = torch.tensor(Display(source).beam, dtype=torch.float64)
     head = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     camera_from_lps = torch.stack([torch.linalg.cross(beam, head), -head, beam])
-    return camera_from_lps.T[[2, 0, 1]] + 0.0  # no −0.0
+    return camera_from_lps.T[_PAPER_FROM_LPS] + 0.0  # no −0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +77,9 @@ def errors(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, 
     A row for every object that both place (equations 5 and 6), and `view2`, `view3`, … (7 and 8): `{mm, deg, mm_xyz,
     deg_xyz}` with the displacement of the reference point (of a view: of its source) and the axis angle, and signed
     along IS, LR, AP, the rotation as xyz Euler angles. Of a planned path: `entry_point_mm` (9), `tip_mm` (10),
-    `relative_mm` (11), `path_deg` (12), `guide_deg` (13); what needs a tool is left out where truth or estimate has
-    none. A truth of one view is compared with the first. Raises `InputError` if the numbers of views differ otherwise.
+    `relative_mm` (11), `path_deg` (12), `guide_deg` (13), all where the tool was imaged; what needs a tool is left
+    out where truth or estimate has none. A truth of one view is compared with the first. Raises `InputError` if the
+    numbers of views differ otherwise.
     """
     if len(truth.camera_from_camera1) == 1:
         estimate = estimate.first_views(1)
@@ -109,6 +112,40 @@ def path_displacements(truth: Poses, estimate: Poses, points: ReferencePoints) -
         for key, (name, point) in found.items()
         if name in there and name in here
     }
+
+
+def path_miss(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, Any] | None:
+    """By what motion the tool misses its planned place once it was moved as the estimate tells, with no other error.
+
+    A correction C in the tool's frame (`navigation.Guidance.correction`) brings the tool, at D in truth and at D̂ as
+    estimated, to DC and D̂C. Seen from the object with the planned path, at P and P̂, it then stands at P⁻¹DC in place
+    of P̂⁻¹D̂C: off by the motion P⁻¹DD̂⁻¹P̂, exactly, whatever C is. It holds what the tool's turn error makes of the way
+    from where it was imaged to the bone, which `relative_mm` does not, and is what `Result.path_covariance` is of.
+
+    `{mm, deg, mm_xyz, deg_xyz}`: a turn about the entry point, then a shift. The parts are along, and about, the axes
+    of the object, which for a bone are the patient's and not those of view 1: IS, LR, AP, that is z, x, y of LPS; the
+    turn as a rotation vector. A turn about the guide itself counts. None without plan or tool, or where a pose of these
+    is missing.
+    """
+    plan = points.plan
+    if plan is None or plan.tool is None:
+        return None
+    if any(not {plan.object, plan.tool} <= set(poses.camera1_from) for poses in (truth, estimate)):
+        return None
+    off, believed = (_object_from_tool(poses, plan.object, plan.tool) for poses in (truth, estimate))
+    motion = off @ invert_rigid(believed)
+    shift = transform_points(motion, plan.entry_point[None])[0] - plan.entry_point
+    turn = torch.rad2deg(log_so3(motion[:3, :3]))
+    return {
+        "mm": shift.norm().item(),
+        "deg": turn.norm().item(),
+        "mm_xyz": shift[_PAPER_FROM_LPS].tolist(),
+        "deg_xyz": turn[_PAPER_FROM_LPS].tolist(),
+    }
+
+
+def _object_from_tool(poses: Poses, name: str, tool: str) -> Tensor:
+    return invert_rigid(poses.camera1_from[name]) @ poses.camera1_from[tool]
 
 
 def _path_errors(truth: dict[str, Tensor], estimate: dict[str, Tensor], points: ReferencePoints) -> dict[str, float]:

@@ -161,37 +161,32 @@ def study_moves(folder: File, side: Side, draws: int, seed: int) -> tuple[Array,
 
     Also tells how many runs they are drawn from.
 
-    `folder` holds `runs.parquet` or `runs.csv` with signed errors (estimate minus truth). The robot brings the device
-    where both are believed to fit, so that it ends beside the planned place in the bone by the bone's error minus the
-    device's: at the entry point by `entry_point_mm_lr|ap|is` minus `tip_mm_…`, or, in tables without these, by
-    `femur_mm_…` minus `device_mm_…` at their reference points; turned by `femur_deg_…` minus `device_deg_…`, where both
-    are there. The axes are those of the first view, taken for the patient's: left, back, head; runs of the other side
-    are mirrored. Runs that were not trusted would not have been carried out, and are left out. Raises `InputError` for
-    a missing file or column, or if no run is left.
+    `folder` holds `runs.parquet` or `runs.csv`. A move is that by which the tool would miss after the correction that a
+    run tells, the robot's own error aside: `miss_mm_lr|ap|is` at the entry point and `miss_deg_lr|ap|is` about it,
+    along the axes of LPS, see `evaluation.path_miss`. Errors where the tool was imaged do not tell it: its turn error
+    grows along the way to the bone. Runs of the other side are mirrored. Runs that were not trusted would not have been
+    carried out, and are left out. Raises `InputError` for a missing file or column, or if no run is left.
     """
     table = _read_runs(folder)
-    exact = all(f"{name}_mm_{axis}" in table for name in ("entry_point", "tip") for axis in _AXES)
-    pair = ("entry_point", "tip") if exact else ("femur", "device")
-    columns = [f"{name}_mm_{axis}" for name in pair for axis in _AXES]
+    columns = [f"miss_{unit}_{axis}" for unit in ("mm", "deg") for axis in _AXES]
     missing = [name for name in columns if name not in table]
     if missing:
-        raise InputError(f"{folder}: the runs have no column {missing[0]}. Signed errors along each axis are needed.")
-    turns = [f"{name}_deg_{axis}" for name in ("femur", "device") for axis in _AXES]
-    columns += turns if all(name in table for name in turns) else []
+        raise InputError(
+            f"{folder}: the runs have no column {missing[0]}, which tells by what a tool misses after its "
+            "correction; errors where it was imaged, all that older versions kept, do not tell it. Run the study again."
+        )
     try:
         values = np.array([table[name] for name in columns], float).T
     except (TypeError, ValueError) as error:
-        raise InputError(f"{folder}: numbers were expected in the columns of errors ({shortened(error)}).") from error
+        raise InputError(
+            f"{folder}: numbers were expected in the columns {columns[0]}, … ({shortened(error)})."
+        ) from error
     kept = np.isfinite(values).all(1)
     if "trusted" in table:
         kept &= np.array([str(value).lower() in ("true", "1") for value in table["trusted"]], bool)
     if not kept.any():
-        raise InputError(f"{folder}: no trusted run with errors of {pair[0]} and {pair[1]}.")
-    values = values[kept]
-    found = np.zeros((len(values), 6))
-    found[:, :3] = values[:, :3] - values[:, 3:6]
-    if values.shape[1] > 6:
-        found[:, 3:] = values[:, 6:9] - values[:, 9:]
+        raise InputError(f"{folder}: no trusted run that tells by what a corrected tool misses.")
+    found = values[kept]
     if "side" in table:
         sides = np.array([str(value).strip().lower() for value in table["side"]])[kept]
         if strange := sorted(set(sides.tolist()) - {*_OTHER_SIDE, *_NO_SIDE}):

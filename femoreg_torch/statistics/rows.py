@@ -39,9 +39,21 @@ ROUNDS = (
     "left_deg",
 )  # guide from path, before and after a round
 _PARTS = tuple(f"{point}_mm_{axis}" for point in ("entry_point", "tip") for axis in AXES)  # optional
+_MISS = "miss_mm", "miss_deg"  # optional: of the tool, once it was moved as the run tells; see `evaluation.path_miss`
+_MISS_PARTS = tuple(f"{total}_{axis}" for total in _MISS for axis in AXES)
 _OPEN = tuple(BEADS + q.column for q in METRICS)
-NUMBERS = (*_SIGNED, *(q.column for q in METRICS), *_PARTS, *SIGMAS, PELVIS_AT_HEAD, *ROUNDS, *_OPEN)
-_NOT_NEGATIVE = {*(q.column for q in QUANTITIES), *SIGMAS}
+NUMBERS = (
+    *_SIGNED,
+    *(q.column for q in METRICS),
+    *_PARTS,
+    *_MISS,
+    *_MISS_PARTS,
+    *SIGMAS,
+    PELVIS_AT_HEAD,
+    *ROUNDS,
+    *_OPEN,
+)
+_NOT_NEGATIVE = {*(q.column for q in QUANTITIES), *_MISS, *SIGMAS}
 _NOT_TEXT = ("number", "seed", "trusted")
 
 

@@ -7,7 +7,7 @@ from sim.study import plans as planning
 from sim.study.chosen import DATA
 from sim.study.plans_page import write_plans
 
-_PAPER_RUNS = Path(__file__).resolve().parents[2] / "docs" / "results" / "paper"
+_PAPER_RUNS = Path(__file__).resolve().parents[2] / "docs" / "results" / "paper_60"
 
 
 def plans(

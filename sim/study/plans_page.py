@@ -111,7 +111,8 @@ def _errors(all_found: Sequence[Measured]) -> str:
     """Gains under the errors of registrations: of the toolkit's study, and as large as the paper's on cadavers."""
     drawn = [
         f"**Registration errors**, {found.subject.title}: {len(found.draws['outcomes']['draws'])} draws from the "
-        f"trusted runs of [the study of the paper's protocol](results/README.md), shifts and turns, cement anew: "
+        f"{found.draws['study_runs']} trusted runs of [60 of the paper's procedures](results/README.md), each after "
+        "the correction that it tells, cement anew: "
         f"gain {found.draws['gain_percent_median']:.1f} % (5 to 95 %: {found.draws['gain_percent_p5']:.1f} to "
         f"{found.draws['gain_percent_p95']:.1f} %), as planned {found.draws['planned_gain_percent']:.1f} %."
         for found in all_found

@@ -42,6 +42,7 @@ def _of_round(record: Record) -> Row:
         row["pelvis_at_head_mm"] = record["pelvis_at_head_mm"]
     for point, shift in (record.get("displacements_mm") or {}).items():
         row |= {f"{point}_mm_{axis}": part for axis, part in zip(AXES, shift, strict=True)}
+    row |= flat_errors({"miss": record["miss"]} if record.get("miss") else {})
     axes = _camera_axes(record.get("source", "anterior"))
     for name, quality in record.get("quality", {}).items():
         row[f"{name}_trusted"] = quality["trusted"]

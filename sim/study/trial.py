@@ -12,7 +12,14 @@ from torch import Tensor
 from femoreg_torch.case import Case, Result
 from femoreg_torch.case.femoroplasty import DEVICE, FEMUR, PELVIS
 from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation import ReferencePoints, errors, overlay_figure, path_displacements, reference_points
+from femoreg_torch.evaluation import (
+    ReferencePoints,
+    errors,
+    overlay_figure,
+    path_displacements,
+    path_miss,
+    reference_points,
+)
 from femoreg_torch.evaluation.overlay import Picture
 from femoreg_torch.files import plain, temporary_file
 from femoreg_torch.geometry import Poses, transform_points
@@ -90,6 +97,7 @@ def _measured(case: Case, scene: Scene, result: Result) -> dict[str, Any]:
         "errors": errors(truth, result.poses, points),
         "pelvis_at_head_mm": _pelvis_at_head(truth, result.poses, points),
         "displacements_mm": path_displacements(truth, result.poses, points),
+        "miss": path_miss(truth, result.poses, points),
         "start_errors": {name: row for name, row in errors(truth, at_start, points).items() if name in _STARTED},
         "asked": _asked(truth, scene),
     }

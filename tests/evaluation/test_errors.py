@@ -2,16 +2,19 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
-from femoreg_torch.case import Case, PlannedPath, View
+from femoreg_torch.case import Case, CaseObject, PlannedPath, Result, View
+from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.errors import InputError
-from femoreg_torch.evaluation import ReferencePoints, errors, path_displacements, reference_points
+from femoreg_torch.evaluation import ReferencePoints, errors, path_displacements, path_miss, reference_points
 from femoreg_torch.evaluation.errors import paper_from_camera
 from femoreg_torch.fluoro import Display
-from femoreg_torch.geometry import Camera, CArm, Poses, exp_so3, poses_by_object, rigid
+from femoreg_torch.geometry import Camera, CArm, Poses, exp_so3, invert_rigid, poses_by_object, rigid, transform_points
+from femoreg_torch.navigation import guide
 
 
 def vector(*values):
@@ -203,3 +206,58 @@ def test_a_truth_of_the_first_view_without_the_first_object_tells_of_the_rest(tr
     part = errors(without(truth, "pelvis").first_views(1), estimate, POINTS)
     assert part == {key: row for key, row in whole.items() if key not in ("pelvis", "view2", "view3")}
     assert part["relative_mm"] == pytest.approx(2.0)
+
+
+def test_a_tool_that_is_turned_misses_by_its_way_to_the_bone(truth):
+    """By hand: upright before the patient, tip 250 mm in front of the entry point, the tool taken to be turned by 0.2°.
+
+    The turn is about the patient's left-right axis through the tip: where the tool was imaged, nothing is off. The
+    estimate turns front (−P) to the feet (−S); carried 250 mm to the back, the true tool ends by 250 · sin 0.2° above
+    the entry point, short by 250 · (1 − cos 0.2°), and turned by 0.2° the other way.
+    """
+    camera1_from_lps = rigid(torch.tensor(UPRIGHT["anterior"], dtype=torch.float64), vector(0, 0, 800))
+    device = camera1_from_lps @ rigid(translation=POINTS.plan.entry_point + vector(0, -250, 0) - POINTS.guide[1])
+    poses = dict.fromkeys(("pelvis", "femur"), camera1_from_lps) | {"device": device}
+    truth = Poses(torch.eye(4, dtype=torch.float64)[None], poses)
+    angle = math.radians(0.2)
+    tip = POINTS.guide[1]
+    turn = rigid(translation=tip) @ rigid(exp_so3(vector(angle, 0, 0))) @ rigid(translation=-tip)
+    estimate = truth.with_object("device", device @ turn)
+    assert errors(truth, estimate, POINTS)["relative_mm"] == pytest.approx(0, abs=1e-9)
+    found = path_miss(truth, estimate, POINTS)
+    assert found["mm"] == pytest.approx(2 * 250 * math.sin(angle / 2))
+    assert found["mm_xyz"] == pytest.approx([-250 * math.sin(angle), 0, -250 * (1 - math.cos(angle))])
+    assert found["deg_xyz"] == pytest.approx([0, -0.2, 0], abs=1e-9)
+
+
+def test_a_miss_is_what_the_told_correction_leaves(truth):
+    """Steered by `navigation` from wrong poses, carried out on the true tool, seen from the true femur."""
+    case = Case(
+        Path(), CArm(Camera(1000.0, (0.5, 0.5), (8, 8), (3.5, 3.5)), (0, 0, 600), (0, 1, 0)), {}, plan=POINTS.plan
+    )
+    base, tip = POINTS.guide
+    case = replace(case, objects={"device": CaseObject("device", points={"base": base, "tip": tip})})
+    wrong = [rigid(exp_so3(vector(0.01, -0.02, 0.015)), vector(0.5, -1, 2)), rigid(exp_so3(vector(-0.02, 0.01, 0)))]
+    estimate = truth
+    for name, motion in zip(("femur", "device"), wrong, strict=True):
+        estimate = estimate.with_object(name, truth.camera1_from[name] @ motion)
+    points, directions = path_in_camera1(case, estimate)
+    result = Result(estimate, {}, path=("femur", "device"), points_camera1=points, directions_camera1=directions)
+    steered = truth.camera1_from["device"] @ guide(result).correction
+    found = path_miss(truth, estimate, POINTS)
+    shift, turn = (vector(*found[key])[[1, 2, 0]] for key in ("mm_xyz", "deg_xyz"))
+    motion = rigid(exp_so3(torch.deg2rad(turn)))
+    entry, target = POINTS.plan.entry_point, POINTS.plan.target
+    tip_in_femur = transform_points(invert_rigid(truth.camera1_from["femur"]) @ steered, tip[None])[0]
+    torch.testing.assert_close(tip_in_femur, entry + shift, atol=1e-9, rtol=0)
+    guide_in_femur = invert_rigid(truth.camera1_from["femur"])[:3, :3] @ steered[:3, :3] @ (tip - base)
+    expected = motion[:3, :3] @ (target - entry)
+    torch.testing.assert_close(guide_in_femur / guide_in_femur.norm(), expected / expected.norm(), atol=1e-9, rtol=0)
+    assert found["mm"] > 5  # far more than where the tool was imaged
+
+
+def test_without_a_plan_or_a_tool_nothing_misses(truth):
+    assert path_miss(truth, truth, replace(POINTS, plan=None)) is None
+    assert path_miss(truth, truth, replace(POINTS, plan=replace(POINTS.plan, tool=None))) is None
+    assert path_miss(truth, without(truth, "device"), POINTS) is None
+    assert path_miss(truth, truth, POINTS)["mm"] == pytest.approx(0, abs=1e-9)

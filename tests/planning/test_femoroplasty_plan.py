@@ -302,12 +302,12 @@ def test_commands_end_to_end(
     assert offsets["planned_n"] == pytest.approx(planned, rel=1e-6)
     study = folder / "study"
     study.mkdir()
-    columns = {f"{name}_mm_{axis}": [0.4, -0.7] for name in ("femur", "device") for axis in ("lr", "ap", "is")}
+    columns = {f"miss_{unit}_{axis}": [0.0, 0.0] for unit in ("mm", "deg") for axis in ("lr", "ap", "is")}
     parquet.write_table(table(columns), study / "runs.parquet")
     assert main(["plan-robustness", str(out), "--study", str(study), "--draws", "1"]) == 0
     found = json.loads(
         (out / "robustness.json").read_text(encoding="utf-8")
-    )  # both err alike: the path is where it was planned
+    )  # nothing misses: the path is where it was planned
     assert found["gain_percent_median"] == pytest.approx(found["planned_gain_percent"])
     assert found["study_runs"] == 2
     assert "The errors are those of 2 trusted runs of the study" in " ".join(capsys.readouterr().out.split())
@@ -328,7 +328,7 @@ def test_commands_end_to_end(
     bad = folder / "bad"
     bad.mkdir()
     (bad / "sure.csv").write_bytes(b"\xff\xfe1 2 3")
-    hostile = {"words": columns | {"femur_mm_lr": ["a", "b"]}, "empty": {name: [] for name in [*columns, "trusted"]}}
+    hostile = {"words": columns | {"miss_mm_lr": ["a", "b"]}, "empty": {name: [] for name in [*columns, "trusted"]}}
     for name, content in hostile.items():
         (bad / name).mkdir()
         parquet.write_table(table(content), bad / name / "runs.parquet")

@@ -58,6 +58,7 @@ class Cheap:
                 "errors": {"pelvis": pose_error(rng), "tip_mm": rng.random()},
                 "start_errors": {"pelvis": pose_error(rng)},
                 "displacements_mm": {"tip": rng.random(3)},
+                "miss": pose_error(rng),
                 "quality": {"pelvis": {"trusted": True, **deviations}},
                 "stages": [{"name": "pelvis in view 1", "view": None, "evaluations": 7, "seconds": time.time() % 1}],
                 "timings_s": {"total": time.time() % 1},

@@ -15,8 +15,9 @@ from torch import Tensor
 from femoreg_torch.case import Result, read_case
 from femoreg_torch.case.quality import ObjectQuality
 from femoreg_torch.case.result import path_in_camera1
+from femoreg_torch.evaluation import path_miss, reference_points
 from femoreg_torch.fluoro import read_image
-from femoreg_torch.geometry import Poses, invert_rigid, rotation_angle, transform_points
+from femoreg_torch.geometry import Poses, exp_so3, invert_rigid, rigid, rotation_angle, transform_points
 from sim.study.closed_loop import ClosedLoop, run_rounds
 from sim.study.conditions import Body, Condition
 from sim.study.record import Record
@@ -116,6 +117,22 @@ def test_a_robot_leaves_its_own_error_and_a_registration_its_own(coarse_root: Pa
     (off,) = run(coarse_root, "shifted", ClosedLoop(1, 0.0, 0.0), registered(shifted))
     assert off["left_mm"] == pytest.approx(5, abs=1e-5)
     assert off["left_deg"] == pytest.approx(0, abs=1e-4)
+
+
+def test_an_exact_robot_leaves_the_miss_that_a_study_keeps(coarse_root: Path) -> None:
+    """A tool that is taken to be turned by half a degree: what the loop measures is what `path_miss` tells."""
+
+    def turned(poses: Poses) -> Poses:
+        turn = rigid(exp_so3(torch.tensor([0.005, -0.006, 0.004], dtype=torch.float64)))
+        return poses.with_object("device", poses.camera1_from["device"] @ turn)
+
+    (off,) = run(coarse_root, "turned", ClosedLoop(1, 0.0, 0.0), registered(turned))
+    case = read_case(coarse_root / "loop" / "turned" / "round1")
+    assert case.truth is not None
+    found = path_miss(case.truth, turned(case.truth), reference_points(case))
+    assert found is not None
+    assert found["mm"] > 0.5
+    assert off["left_mm"] == pytest.approx(found["mm"], abs=1e-5)
 
 
 def test_what_is_not_trusted_moves_no_robot(coarse_root: Path) -> None:

@@ -19,6 +19,7 @@ DRAWN: dict[str, Any] = {
     "gain_percent_p95": 41.0,
     "planned_gain_percent": 40.0,
     "outcomes": {"draws": [{}] * 20},
+    "study_runs": 59,
 }
 # 3 % per mm along one axis: with 2.64 mm in the mean, 1.654 mm along each axis, 5 % in the end
 FLAT = Response(40.0, np.array([3.0, 0, 0, 0, 0]), np.zeros(5), 4.0, np.zeros(3), np.array([-60.0, 0, 30]))

@@ -52,6 +52,7 @@ def test_the_columns_are_those_that_were_agreed_on(records: list[dict[str, Any]]
     }
     wanted |= {f"pelvis_sigma_{unit}_{axis}" for unit in ("mm", "deg") for axis in ("is", "lr", "ap")}
     wanted |= {"tip_mm", "tip_mm_is", "tip_mm_lr", "tip_mm_ap", "seconds_run", "seconds_total"}
+    wanted |= {f"miss_{unit}{axis}" for unit in ("mm", "deg") for axis in ("", "_is", "_lr", "_ap")}
     wanted |= {"evaluations_pelvis_in_view_1", "seconds_pelvis_in_view_1"}
     assert wanted <= set(table.column_names)
 
@@ -69,6 +70,7 @@ def test_errors_are_named_and_signed(records: list[dict[str, Any]]) -> None:
     assert row["pelvis_mm"] == error["mm"]
     assert [row[f"pelvis_deg_{axis}"] for axis in ("is", "lr", "ap")] == error["deg_xyz"]
     assert row["tip_mm"] == records[0]["errors"]["tip_mm"]
+    assert [row[f"miss_mm_{axis}"] for axis in ("is", "lr", "ap")] == records[0]["miss"]["mm_xyz"]
     assert row["start_pelvis_deg"] == records[0]["start_errors"]["pelvis"]["deg"]
 
 

@@ -65,6 +65,7 @@ def test_a_record_holds_start_result_and_cost(record: dict[str, Any]) -> None:
     # detections of 3 mm in error, mended by outlines: never the truth itself, and up to some centimetres in depth
     assert 0.1 < record["start_errors"]["pelvis"]["mm"] < 100
     assert record["errors"]["device"] == record["start_errors"]["device"]  # the plan does not move it
+    assert record["miss"]["mm"] > 0
     assert 4 <= record["landmarks_used"] <= 14
     assert [stage["name"] for stage in record["stages"]] == ["pelvis"]
     assert record["stages"][0]["evaluations"] == 20
