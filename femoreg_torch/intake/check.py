@@ -42,13 +42,21 @@ from femoreg_torch.intake.found import Found, alike_together
 from femoreg_torch.intake.planes import Picture, side_by_side, stacked
 from femoreg_torch.intake.start_picture import picture_of_start
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
-from femoreg_torch.registration.models import BEYOND_MM, GUIDE_MM, model_attenuation, told_of_end, told_of_middle
+from femoreg_torch.registration.models import (
+    BEYOND_MM,
+    GUIDE_MM,
+    model_attenuation,
+    told_of_end,
+    told_of_leaning,
+    told_of_middle,
+)
 from femoreg_torch.volume import is_in_ras, read_ct_told, read_landmarks
 from femoreg_torch.volume.borders import cut_bones
 from femoreg_torch.volume.round_field import round_field
 
 _ANY_PATH = PlannedPath(FEMUR, torch.zeros(3).double(), torch.ones(3).double())
 _ANY_POINTS = {name: n * torch.ones(3).double() for n, name in enumerate(DEVICE_POINTS)}
+_TOLD_OF_GUIDES = told_of_end, told_of_middle, told_of_leaning
 _FAR_MM = 150.0  # from the middle of a device, beyond its own size, no point of it lies
 _FAR_FROM_BONE_MM = 400.0  # a device that starts farther from the entry point is likely told wrong
 
@@ -167,7 +175,7 @@ def _check_device(top: Fields, folder: Path, path: PlannedPath | None, side: Sid
                     "Has the model another unit (inches) or origin than the points?"
                 )
     if volume is not None and "tip" in points and volume.beyond_mm(points["tip"]) <= BEYOND_MM:  # else enough is said
-        found.warnings += [*told_of_end("device", volume, points), *told_of_middle("device", volume, points)]
+        found.warnings += [line for tell in _TOLD_OF_GUIDES for line in tell("device", volume, points)]
     if {"tip", "base"} <= set(points):
         length = float((points["tip"] - points["base"]).norm())
         if not GUIDE_MM[0] <= length <= GUIDE_MM[1]:
@@ -208,8 +216,9 @@ def _check_written_out(case: Case, found: Found) -> tuple[SeenAnatomy, dict[str,
         if thing.model is not None:
             model = found.attempt(lambda thing=thing: model_attenuation(thing.model))  # type: ignore[misc]
             if model is not None:
-                found.warnings += told_of_end(thing.name, model.volume, thing.points)
-                found.warnings += told_of_middle(thing.name, model.volume, thing.points)
+                found.warnings += [
+                    line for tell in _TOLD_OF_GUIDES for line in tell(thing.name, model.volume, thing.points)
+                ]
     if case.ct_path is None or case.labels_path is None:
         return SeenAnatomy(landmarks=case.landmarks, anatomy=case.anatomy), images
     read = found.attempt(lambda: read_ct_told(cast(Path, case.ct_path)))

@@ -54,7 +54,7 @@ _GAIN_OF_DRIFT, _GAIN_OF_SURE_DRIFT = 0.002, 0.001
 # 0.7 to 1.4 mm, by 5 deviations and more, and gained 0.0016; turns of 4 to 8° as 2.5 to 5°, by 1.5 to 2.9 deviations,
 # and gained 0.0005.
 _MOST_SLIDE_MM, _SURE_OF_SLIDE, _GAIN_OF_SLIDE = 0.6, 3.0, 0.0003
-_MOST_TURN_DEG, _SURE_OF_TURN, _GAIN_OF_TURN = 2.0, 1.5, 0.0003
+_MOST_TURN_DEG, _SURE_OF_TURN, _GAIN_OF_TURN = 2.0, 1.2, 0.0003
 # Of a bone in one view, beside the others. Where a leg had turned by 1.8° from view to view: 0.018, and where a neck
 # had broken 0.0029 and more. Of 16 right ones of two simulators, with bad CTs, shutters and metal too: at most 0.0007.
 _GAIN_OF_BONE_DRIFT = 0.003
@@ -81,9 +81,10 @@ _SURE_OF_BREAK = 4.0
 # label maps too, at most 0.00014; where a leg had moved as a whole 0.0032, with its ends 0.1 mm apart.
 _LEAST_GAIN_OF_BEND = 0.0002
 _GAIN_OF_BREAK, _APART_OF_BREAK_MM = 0.0008, 0.8
-# Of a model whose materials are known. Nine right ones of another simulator gained 0.00014 at most. A wire that was
-# bowed by 4 mm was 0.6 and 1.1 mm apart, by 8.9 and 5.5 deviations, and gained 0.0003.
-_MOST_APART_OF_KNOWN_MM = 0.5
+# Of a model whose materials are known. Of 14 right ones of two other simulators the ends seemed at most 0.4 mm
+# apart where that gained anything. A wire that was bowed by 4 mm was 0.6 and 1.1 mm apart, by 8.9 and 5.5 deviations,
+# and gained 0.0003.
+_MOST_APART_OF_KNOWN_MM, _SURE_OF_A_KNOWN_BEND = 0.5, 5.0
 # Of a model whose materials are estimated: less gain is believed of an end that is surely elsewhere alone. On images
 # of two other simulators five right devices seemed 1.1 to 5.4 mm apart, by 4.5 to 5.7 deviations and gains of 0.0003 to
 # 0.0005; four bent ones gained 0.0014 to 0.005, by 8.5 to 18.
@@ -390,4 +391,5 @@ def _is_bent(found: Bend, is_model: bool, materials_known: bool) -> bool:
     broken = not is_model and found.gain > _GAIN_OF_BREAK and found.apart_mm > _APART_OF_BREAK_MM
     sure_of_materials = not is_model or materials_known
     told = sure_of_materials or found.gain > _GAIN_OF_A_BENT_MODEL or found.sureness > _SURE_OF_A_BENT_MODEL
-    return broken or (apart and told and found.sureness > _SURE_OF_BEND and found.gain > _LEAST_GAIN_OF_BEND)
+    surely = found.sureness > (_SURE_OF_A_KNOWN_BEND if materials_known else _SURE_OF_BEND)
+    return broken or (apart and told and surely and found.gain > _LEAST_GAIN_OF_BEND)

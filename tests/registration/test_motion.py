@@ -197,7 +197,7 @@ def test_a_round_device_is_not_asked_for_its_turn() -> None:
         (False, 0.4, 5, 0.001, None),  # small
         (True, 1.5, 5, 0.001, None),
         (False, 1.4, 2, 0.001, None),  # unsure
-        (True, 3.4, 1.2, 0.001, None),
+        (True, 3.4, 1.0, 0.001, None),
         (False, 1.4, 5, 0.0001, None),  # explains nothing
         (True, 3.4, 2.5, 0.0001, None),
     ],

@@ -63,6 +63,23 @@ def test_a_break_that_is_small_and_yet_explains_the_images_is_doubted(
         assert len(doubts_about_rigidity(scene, TRUTH, PLAIN)) == told, (apart, gain)
 
 
+@pytest.mark.parametrize(
+    ("known", "apart", "sigmas", "told"),
+    [(True, 0.7, 8, 1), (False, 0.7, 8, 0), (True, 0.4, 8, 0), (True, 0.7, 4.5, 0)],
+)
+def test_a_model_of_known_materials_is_doubted_sooner(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, known: bool, apart: float, sigmas: float, told: int
+) -> None:
+    """Where materials are estimated, what is wrong with them may look like ends that lie apart."""
+    motion = torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64)
+    ends = Bend(motion, motion.abs() / sigmas + 1e-9, apart, 0.3, 0.0003)
+    monkeypatch.setattr(doubts, "bend", lambda *asked: ends if asked[2] == "device" else None)
+    device = scene.objects["device"]
+    device = replace(device, parts=(device.volume,), materials_known=known)
+    asked = replace(scene, objects=scene.objects | {"device": device})
+    assert len(doubts_about_rigidity(asked, TRUTH, PLAIN)) == told
+
+
 def test_an_end_that_no_two_views_show_is_not_asked(scene: Scene) -> None:
     beside = TRUTH.with_object(
         "device", off(TRUTH.camera1_from["device"], REFERENCE_POINTS["device"], (0, 0, 0), (150, 0, 0))
