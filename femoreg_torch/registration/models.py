@@ -95,8 +95,8 @@ def told_of_leaning(name: str, volume: Volume, points: Mapping[str, Tensor]) -> 
     if end is None or not end.leaning_deg > _MOST_LEANING_DEG:
         return ()
     return (
-        f"the {name}: the line from its base to its tip leans by {end.leaning_deg:.0f}° against the axis of its model's "
-        "end: check these points and the axes of the model",
+        f"the {name}: the line from its base to its tip leans by {end.leaning_deg:.0f}° against the axis of its "
+        "model's end: check these points and the axes of the model",
     )
 
 
