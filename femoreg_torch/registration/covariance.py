@@ -36,7 +36,7 @@ from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.intrinsics import Intrinsics, Profile, profile
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.motion import (
-    AlongGuide,
+    GuideDrift,
     MotionBetween,
     drifts_along_guides,
     drifts_between_views,
@@ -68,7 +68,7 @@ class PoseCovariance:
     step: Tensor  # (6 B,): where all images together would move the bodies, were all free with these intrinsics
     motions: tuple[MotionBetween, ...] = ()  # of the anatomy between kinds of images, were it free to move
     drifts: tuple[MotionBetween, ...] = ()  # of what other kinds of images show alone, in single views
-    along_guides: tuple[AlongGuide, ...] = ()  # of tools in single views
+    guide_drifts: tuple[GuideDrift, ...] = ()  # of tools in single views
 
     def of(self, first: str, second: str | None = None) -> Tensor:
         """The block (6, 6) of one body, or of two."""

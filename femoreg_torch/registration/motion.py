@@ -52,7 +52,7 @@ class MotionBetween:
 
 
 @dataclass(frozen=True)
-class AlongGuide:
+class GuideDrift:
     """How a tool lies in one view along or about its guide, beside where its other views show it."""
 
     kind: Kind
@@ -124,7 +124,7 @@ def drifts_along_guides(
     images: Sequence[Image],
     names: Sequence[str],
     centres: Tensor,
-) -> tuple[AlongGuide, ...]:
+) -> tuple[GuideDrift, ...]:
     """Slides of every tool along its guide, and turns about it, in one view beside its other views.
 
     A hand that holds a tool lets it slide or turn so most easily. One unknown is told far more surely than the six of
@@ -146,7 +146,7 @@ def drifts_along_guides(
             moves[n, :, 0] = way
             for kind, view in views if not turns or scene.objects[name].axis is None else ():
                 amount, deviation, gain = _step(parts, [each == (kind, view) for each in images], moves.flatten(0, 1))
-                found.append(AlongGuide(kind, view, name, turns, float(amount), float(deviation), gain))
+                found.append(GuideDrift(kind, view, name, turns, float(amount), float(deviation), gain))
     return tuple(found)
 
 

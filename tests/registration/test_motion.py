@@ -12,7 +12,7 @@ from femoreg_torch.geometry import about_point, exp_se3
 from femoreg_torch.registration.covariance import pose_covariance
 from femoreg_torch.registration.doubts import doubts_about_guides, doubts_about_motion
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.motion import AlongGuide, MotionBetween
+from femoreg_torch.registration.motion import GuideDrift, MotionBetween
 from femoreg_torch.registration.roundness import Axis
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.similarity import GradNcc
@@ -167,7 +167,7 @@ _TURNED = torch.tensor([0.0, 0, math.radians(5), 0, 0, 0], dtype=torch.float64)
 def test_a_slide_or_a_turn_in_one_view_is_measured(way: Tensor, turns: bool, amount: float, view: int) -> None:
     """By an independent motion of the device in the image of that view, on pixels of 3 mm."""
     covariance = pose_covariance(_held(way, view), true_poses(), _LEVEL, GradNcc(1))
-    found = {(each.view, each.turns): each for each in covariance.along_guides}
+    found = {(each.view, each.turns): each for each in covariance.guide_drifts}
     assert set(found) == {(n, t) for n in range(3) for t in (False, True)}
     moved = found[view, turns]
     assert moved.amount == pytest.approx(amount, abs=1.5 * moved.deviation)
@@ -177,7 +177,7 @@ def test_a_slide_or_a_turn_in_one_view_is_measured(way: Tensor, turns: bool, amo
 
 def test_a_device_that_was_held_still_neither_slides_nor_turns() -> None:
     covariance = pose_covariance(_held(torch.zeros(6, dtype=torch.float64), 1), true_poses(), _LEVEL, GradNcc(1))
-    assert max(each.sureness for each in covariance.along_guides) < 3
+    assert max(each.sureness for each in covariance.guide_drifts) < 3
     assert doubts_about_guides(covariance) == ()
 
 
@@ -186,7 +186,7 @@ def test_a_round_device_is_not_asked_for_its_turn() -> None:
     axis = Axis(torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0, 1], dtype=torch.float64))
     scene = replace(scene, objects=scene.objects | {"device": replace(scene.objects["device"], axis=axis)})
     covariance = pose_covariance(scene, true_poses(), _LEVEL, GradNcc(1))
-    assert {each.turns for each in covariance.along_guides} == {False}
+    assert {each.turns for each in covariance.guide_drifts} == {False}
 
 
 @pytest.mark.parametrize(
@@ -205,9 +205,9 @@ def test_a_round_device_is_not_asked_for_its_turn() -> None:
 def test_what_is_far_sure_and_explains_something_is_told(
     turns: bool, amount: float, sigmas: float, gain: float, words: str | None
 ) -> None:
-    found = AlongGuide("device", 1, "device", turns, amount, abs(amount) / sigmas, gain)
+    found = GuideDrift("device", 1, "device", turns, amount, abs(amount) / sigmas, gain)
     covariance = replace(
-        pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), drifts=(), along_guides=(found,)
+        pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), drifts=(), guide_drifts=(found,)
     )
     told = doubts_about_motion(covariance)
     assert len(told) == (words is not None)
