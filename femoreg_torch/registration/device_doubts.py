@@ -195,6 +195,18 @@ def _ends_elsewhere(found: TipLength) -> bool:
     return abs(found.longer_mm) > _MOST_OFF_TIP_MM and found.gain > _LEAST_GAIN_OF_TIP
 
 
+def notes_on_unseen_tips(case: Case, scene: Scene, poses: Poses) -> tuple[str, ...]:
+    """Guides whose end no image shows, in words: how long they are is taken from their models alone."""
+    clear = scene.where_unsaturated()
+    return tuple(
+        f"no image shows where the guide of the {name} ends, or it is saturated there: that the guide is as long as its "
+        "model was not asked; let the images show the tip"
+        for name, _ in _models(scene, poses)
+        if {"base", "tip"} <= set(points := case.objects[name].points)
+        and not in_view(clear, poses, name, model_end(points)[None]).any()
+    )
+
+
 def doubts_beside_devices(scene: Scene, poses: Poses, imaging: Imaging, in_doubt: bool) -> tuple[str, ...]:
     """Other things that a device may have been taken for, in words.
 

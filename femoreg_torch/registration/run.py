@@ -19,6 +19,7 @@ from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import CArm, Poses, check_rigid
 from femoreg_torch.registration.another_view import start_from_a_view
+from femoreg_torch.registration.device_doubts import notes_on_unseen_tips
 from femoreg_torch.registration.display_told import doubts_about_the_display
 from femoreg_torch.registration.doubts import doubts
 from femoreg_torch.registration.kernels import load_kernels
@@ -178,6 +179,7 @@ def register_scene(
             *scene.missing,
             *outcome.skipped,
             *_unchecked(case, scene, began),
+            *notes_on_unseen_tips(case, scene, outcome.poses),
             *notes_on_the_carm(case.carm, outcome.poses),
         ),
         path=None if case.plan is None else (case.plan.object, case.plan.tool),

@@ -13,7 +13,12 @@ from torch.nn import functional as F
 from femoreg_torch.case import Case, CaseObject, Model, Start
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, CArm, centred_camera, project_points, transform_points
-from femoreg_torch.registration.device_doubts import doubts_about_size, doubts_about_told_tips, doubts_about_units
+from femoreg_torch.registration.device_doubts import (
+    doubts_about_size,
+    doubts_about_told_tips,
+    doubts_about_units,
+    notes_on_unseen_tips,
+)
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.registration.sizes import device_size
@@ -78,6 +83,29 @@ def larger(volume: Volume, factor: float) -> Volume:
     affine = volume.lps_from_index.clone()
     affine[:3] *= factor
     return Volume(volume.data, affine)
+
+
+@pytest.mark.parametrize("how", ["not exposed", "saturated"])
+def test_it_is_said_where_no_image_shows_the_end_of_a_guide(scene: Scene, how: str) -> None:
+    """One view that shows it is enough."""
+    hidden = []
+    for view in range(3):
+        camera = scene.camera(TRUTH, view)
+        tip = transform_points(TRUTH.camera_from("device")[view], TIP[None])
+        column, row = project_points(camera, tip)[0].round().long().tolist()
+        mask = torch.zeros(camera.shape, dtype=torch.bool)
+        mask[row - 4 : row + 5, column - 4 : column + 5] = True
+        hidden.append(mask)
+
+    def behind(masks: list[Tensor]) -> Scene:
+        if how == "saturated":
+            return replace(scene, saturated={"device": tuple(masks)})
+        return replace(scene, fields={"device": tuple(~mask for mask in masks)})
+
+    assert not notes_on_unseen_tips(CASE, scene, TRUTH)
+    assert not notes_on_unseen_tips(CASE, behind([*hidden[:2], torch.zeros_like(hidden[2])]), TRUTH)
+    (note,) = notes_on_unseen_tips(CASE, behind(hidden), TRUTH)
+    assert note.startswith("no image shows where the guide of the device ends")
 
 
 def test_a_device_as_its_model_has_it_is_not_doubted(scene: Scene) -> None:
