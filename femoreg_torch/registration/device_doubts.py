@@ -199,8 +199,8 @@ def notes_on_unseen_tips(case: Case, scene: Scene, poses: Poses) -> tuple[str, .
     """Guides whose end no image shows, in words: how long they are is taken from their models alone."""
     clear = scene.where_unsaturated()
     return tuple(
-        f"no image shows where the guide of the {name} ends, or it is saturated there: that the guide is as long as its "
-        "model was not asked; let the images show the tip"
+        f"no image shows where the guide of the {name} ends, or it is saturated there: that the guide is as long as "
+        "its model was not asked; let the images show the tip"
         for name, _ in _models(scene, poses)
         if {"base", "tip"} <= set(points := case.objects[name].points)
         and not in_view(clear, poses, name, model_end(points)[None]).any()

@@ -7,11 +7,13 @@ long axis, the images would move its ends apart.
 The shaft of a long bone is nearly round. Derivatives do not say that no image tells its turn about its long axis
 (`registration.turns`): what the voxels draw, and a pin that crosses it, turned such an end by 17°. So ends that seem
 to lie apart are asked again, without the turns of an end about its long axis that it may go on by for nearly nothing.
+A bone whose ends lie apart by such a turn alone is asked without any of them.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -37,6 +39,7 @@ _TURN_DEG = 20.0  # about its long axis, to both sides: an end that loses next t
 _INSIDE = 0.2  # of the greatest attenuation: what counts as the object
 _MOST_POINTS = 2_000
 _LEAST_DEVIATION = 1e-6  # degrees and mm: a turn that is held has none but by rounding
+Turns = Literal["all", "told", "none"]  # of an end about its long axis: which it makes; `told`: those that images tell
 _LEAST_POINTS, _LEAST_SHARE = 30, 0.05  # of each end, among those that the images show
 
 
@@ -98,11 +101,16 @@ class _Cut:
         inverse = ways @ torch.linalg.pinv(ways.T @ model.hessian @ ways, hermitian=True) @ ways.T
         return _Fitted(poses, bodies, model.value, inverse @ (model.scores.T @ model.scores) @ inverse)
 
-    def told(self, poses: Poses) -> Tensor:
-        """The motions (12, n) of the ends that images tell, see `_told`."""
+    def ways(self, poses: Poses, turns: Turns) -> Tensor:
+        """The motions (12, n) of the ends, with such turns about their long axes."""
+        bodies, costs = self.asked(poses, -1)
+        if turns == "all":
+            return torch.eye(len(costs.still), dtype=torch.float64)
         points = zip(self.names, self.ends.points, strict=True)
         axes = [long_axis(transform_points(poses.camera1_from[name], of)) for name, of in points]
-        return _told(*self.asked(poses, -1), axes)
+        about = _about(bodies, axes)
+        held = about if turns == "none" else about[_loses_little(costs, about)]
+        return torch.linalg.svd(held).Vh[len(held) :].T
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,11 +141,12 @@ def images_of(scene: Scene, poses: Poses, name: str, imaging: Imaging) -> tuple[
 
 
 def bend(
-    scene: Scene, poses: Poses, name: str, share: float, images: tuple[ImageCosts, ...] | None, only_told: bool = False
+    scene: Scene, poses: Poses, name: str, share: float, images: tuple[ImageCosts, ...] | None, turns: Turns = "all"
 ) -> Bend | None:
     """Of an object at its pose, cut at a share of its length as far as it is seen; `images` are those of `images_of`.
 
-    With `only_told`, an end does not turn about its long axis where no image tells that turn.
+    With `turns` of "told", an end does not turn about its long axis where no image tells that turn; of "none", no end
+    turns so.
 
     None where the images show too little of one end, or nothing of them is exposed.
     """
@@ -149,9 +158,9 @@ def bend(
     for each in cut.names:
         uncut = uncut.with_object(each, poses.camera1_from[name])
     _, costs = cut.asked(uncut, -1)
-    found = cut.fitted(uncut, torch.eye(len(costs.still), dtype=torch.float64))
-    if only_told:
-        found = cut.fitted(uncut, cut.told(found.poses))
+    found = cut.fitted(uncut, cut.ways(uncut, "all"))
+    if turns != "all":
+        found = cut.fitted(uncut, cut.ways(found.poses, turns))
 
     first, second = (found.poses.camera1_from[each] for each in cut.names)
     one, other = (transform_points(of, cut.ends.middle[None])[0] for of in (first, second))
@@ -166,16 +175,19 @@ def bend(
     return Bend(motion, covariance.diagonal().sqrt(), apart, deviation, gain)
 
 
-def _told(bodies: Sequence[Body], costs: ImageCosts, axes: Sequence[Tensor]) -> Tensor:
-    """The motions (12, n) of two ends that images tell: all but turns of each about its own one of `axes` (3,)."""
-    turns = torch.zeros(len(bodies), len(costs.still), dtype=torch.float64)
+def _about(bodies: Sequence[Body], axes: Sequence[Tensor]) -> Tensor:
+    """Turns (2, 12) of two ends, each about its own one of `axes` (3,), by one radian."""
+    turns = torch.zeros(len(bodies), 6 * len(bodies), dtype=torch.float64)
     for n, (body, axis) in enumerate(zip(bodies, axes, strict=True)):
         turns[n, 6 * n : 6 * n + 3] = axis / body.scale[:3]
-    far = math.radians(_TURN_DEG) * turns
+    return turns
+
+
+def _loses_little(costs: ImageCosts, about: Tensor) -> list[bool]:
+    """Whether an end may go on by each of the turns `about` (2, 12) for nearly nothing."""
+    far = math.radians(_TURN_DEG) * about
     still, *turned = costs(torch.cat([costs.still[None], far, -far])).mean(1).tolist()
-    lost = [min(pair) - still for pair in zip(turned[: len(bodies)], turned[len(bodies) :], strict=True)]
-    held = turns[[loss < TOLD for loss in lost]]
-    return torch.linalg.svd(held).Vh[len(held) :].T
+    return [min(pair) - still < TOLD for pair in zip(turned[: len(about)], turned[len(about) :], strict=True)]
 
 
 def _along(objective: SmoothObjective, ways: Tensor) -> SmoothObjective:
