@@ -77,9 +77,9 @@ def errors(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, 
     A row for every object that both place (equations 5 and 6), and `view2`, `view3`, … (7 and 8): `{mm, deg, mm_xyz,
     deg_xyz}` with the displacement of the reference point (of a view: of its source) and the axis angle, and signed
     along IS, LR, AP, the rotation as xyz Euler angles. Of a planned path: `entry_point_mm` (9), `tip_mm` (10),
-    `relative_mm` (11), `path_deg` (12), `guide_deg` (13), all where the tool was imaged; what needs a tool is left
-    out where truth or estimate has none. A truth of one view is compared with the first. Raises `InputError` if the
-    numbers of views differ otherwise.
+    `relative_mm` (11), `path_deg` (12), `guide_deg` (13), all where the tool was imaged, and `miss_mm`, `miss_deg` of
+    `path_miss`; what needs a tool is left out where truth or estimate has none. A truth of one view is compared with
+    the first. Raises `InputError` if the numbers of views differ otherwise.
     """
     if len(truth.camera_from_camera1) == 1:
         estimate = estimate.first_views(1)
@@ -96,7 +96,9 @@ def errors(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, 
     cameras = zip(truth.camera_from_camera1[1:], estimate.camera_from_camera1[1:], strict=True)
     for number, (true_camera, camera) in enumerate(cameras, 2):
         rows[f"view{number}"] = _row(invert_rigid(true_camera), invert_rigid(camera), source, axes)
-    return rows | _path_errors(there, here, points)
+    miss = path_miss(truth, estimate, points)
+    left = {} if miss is None else {"miss_mm": miss["mm"], "miss_deg": miss["deg"]}
+    return rows | _path_errors(there, here, points) | left
 
 
 def path_displacements(truth: Poses, estimate: Poses, points: ReferencePoints) -> dict[str, Tensor]:

@@ -20,6 +20,7 @@ _NAMES = {
     "path_deg": "planned path",
     "guide_deg": "guide",
 }
+_MISSES = {"miss_mm": "entry point, after an exact correction", "miss_deg": "turn, after an exact correction"}
 
 POSE_COLUMNS = ("", *(f"{axis} mm" for axis in AXES), "total mm", *(f"{axis} °" for axis in AXES), "total °")
 METRIC_COLUMNS = ("", "error", "paper's mean")
@@ -38,11 +39,12 @@ def pose_rows(errors: dict[str, Any]) -> Iterator[list[str]]:
 
 
 def metric_rows(errors: dict[str, Any]) -> Iterator[list[str]]:
-    """Cells of the paper's Table II: each metric and the paper's mean."""
-    for key, paper in PAPER_METRICS.items():
+    """Cells of the paper's Table II: each metric and the paper's mean; below, what a correction leaves."""
+    for key, name in (_NAMES | _MISSES).items():
         if key in errors:
             unit = "mm" if key.endswith("_mm") else "°"
-            yield [_NAMES[key], f"{errors[key]:.2f} {unit}", f"{paper:.2f} {unit}"]
+            paper = f"{PAPER_METRICS[key]:.2f} {unit}" if key in PAPER_METRICS else "–"
+            yield [name, f"{errors[key]:.2f} {unit}", paper]
 
 
 def error_tables(errors: dict[str, Any]) -> list[Table]:

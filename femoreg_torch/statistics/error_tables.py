@@ -5,7 +5,7 @@ import pandas as pd
 from femoreg_torch.statistics.cells import about_runs, error_numbers
 from femoreg_torch.statistics.formats import PAPER, Table, between, number, plus_minus
 from femoreg_torch.statistics.outcome import told
-from femoreg_torch.statistics.quantities import AXES, METRICS, POSE_QUANTITIES, POSES, QUANTITIES
+from femoreg_torch.statistics.quantities import AXES, METRICS, MISSES, POSE_QUANTITIES, POSES, QUANTITIES
 from femoreg_torch.statistics.summary import Statistics, interval_of_mean, statistics
 
 
@@ -56,10 +56,13 @@ def metric_table(rows: pd.DataFrame) -> Table:
 
 
 def error_table(rows: pd.DataFrame, seed: int) -> Table:
-    """Every error in total, with the interval of its mean, its tail, and how many runs each number holds."""
+    """Every error in total, with the interval of its mean, its tail, and how many runs each number holds.
+
+    What a correction leaves stands below where the runs tell it; runs of older versions do not.
+    """
     trusted = rows[rows["trusted"]]
     lines, data = [], []
-    for q in QUANTITIES:
+    for q in (*QUANTITIES, *(q for q in MISSES if q.column in rows)):
         s = statistics(rows, q.column)
         if not s.asked:
             continue

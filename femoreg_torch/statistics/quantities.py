@@ -3,6 +3,7 @@
 The paper is Gao et al., IEEE Trans Med Robot Bionics 2 (2020) 437: Tables I, II and III, Figure 9.
 """
 
+import math
 from dataclasses import dataclass
 
 from femoreg_torch.configs import load_preset
@@ -41,7 +42,7 @@ class Quantity:
     column: str
     name: str
     unit: str  # mm or °
-    paper: Paper
+    paper: Paper  # not a number where the paper tells nothing of it
 
     @property
     def digits(self) -> int:
@@ -82,3 +83,9 @@ METRICS = (
 QUANTITIES = (*(rows[unit][-1] for rows in POSE_QUANTITIES.values() for unit in ("mm", "deg")), *METRICS)
 BY_COLUMN = {quantity.column: quantity for quantity in QUANTITIES}
 RELATIVE = BY_COLUMN["relative_mm"]
+# Of the tool against its planned place, once an exact robot has moved it as the run tells; see `evaluation.path_miss`.
+_UNTOLD = Paper(math.nan, math.nan, math.nan)
+MISSES = (
+    Quantity("miss_mm", "entry point after an exact correction", "mm", _UNTOLD),
+    Quantity("miss_deg", "turn after an exact correction", "°", _UNTOLD),
+)

@@ -17,7 +17,15 @@ from pandas.api.types import is_object_dtype, is_scalar
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.files import temporary_file
 from femoreg_torch.paths import check_readable
-from femoreg_torch.statistics.quantities import AXES, METRICS, OBJECTS, PELVIS_AT_HEAD, POSE_QUANTITIES, QUANTITIES
+from femoreg_torch.statistics.quantities import (
+    AXES,
+    METRICS,
+    MISSES,
+    OBJECTS,
+    PELVIS_AT_HEAD,
+    POSE_QUANTITIES,
+    QUANTITIES,
+)
 
 ROWS_NAME, TRIALS_NAME = "runs.parquet", "trials.parquet"
 IDENTITY = ("study", "condition", "number", "patient", "kind", "side", "seed", "preset", "code", "settings")
@@ -39,7 +47,7 @@ ROUNDS = (
     "left_deg",
 )  # guide from path, before and after a round
 _PARTS = tuple(f"{point}_mm_{axis}" for point in ("entry_point", "tip") for axis in AXES)  # optional
-_MISS = "miss_mm", "miss_deg"  # optional: of the tool, once it was moved as the run tells; see `evaluation.path_miss`
+_MISS = tuple(q.column for q in MISSES)  # optional
 _MISS_PARTS = tuple(f"{total}_{axis}" for total in _MISS for axis in AXES)
 _OPEN = tuple(BEADS + q.column for q in METRICS)
 NUMBERS = (

@@ -59,7 +59,7 @@ def test_a_perfect_estimate_has_no_error(truth):
     found = errors(truth, truth, POINTS)
     poses, metrics = (
         ["pelvis", "femur", "device", "view2", "view3"],
-        ["entry_point_mm", "tip_mm", "relative_mm", "path_deg", "guide_deg"],
+        ["entry_point_mm", "tip_mm", "relative_mm", "path_deg", "guide_deg", "miss_mm", "miss_deg"],
     )
     assert set(found) == {*poses, *metrics}
     for value in found.values():
@@ -225,6 +225,7 @@ def test_a_tool_that_is_turned_misses_by_its_way_to_the_bone(truth):
     estimate = truth.with_object("device", device @ turn)
     assert errors(truth, estimate, POINTS)["relative_mm"] == pytest.approx(0, abs=1e-9)
     found = path_miss(truth, estimate, POINTS)
+    assert errors(truth, estimate, POINTS)["miss_mm"] == found["mm"]
     assert found["mm"] == pytest.approx(2 * 250 * math.sin(angle / 2))
     assert found["mm_xyz"] == pytest.approx([-250 * math.sin(angle), 0, -250 * (1 - math.cos(angle))])
     assert found["deg_xyz"] == pytest.approx([0, -0.2, 0], abs=1e-9)

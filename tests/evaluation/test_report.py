@@ -29,6 +29,7 @@ def test_rows_are_absolute_and_have_the_papers_means_below():
     assert rows[1] == ["  paper", "0.14", "0.12", "0.77", "0.81", "0.65", "0.25", "0.11", "0.73"]
     assert rows[2][0] == "view 2"
     assert list(metric_rows({"relative_mm": 1.0, "femur": ROW})) == [["entry point to tip", "1.00 mm", "1.26 mm"]]
+    assert list(metric_rows({"miss_mm": 0.6})) == [["entry point, after an exact correction", "0.60 mm", "–"]]
 
 
 def test_the_papers_totals_are_near_the_length_of_their_parts():

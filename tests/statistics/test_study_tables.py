@@ -145,6 +145,15 @@ def test_conditions_of_the_same_procedures_tell_no_more_than_one() -> None:
     assert success_table(seven).rows[0][1:4] == ("140 of 140", "100.0 %", "–")
 
 
+def test_what_a_correction_leaves_is_told_where_the_runs_tell_it() -> None:
+    rows = made_up(9)
+    assert not any("correction" in row[0] for row in error_table(rows, 0).rows)
+    table = error_table(rows.assign(miss_mm=np.arange(9.0), miss_deg=0.25), 0)
+    rows_of = {row[0]: row for row in table.rows}
+    assert rows_of["entry point after an exact correction, mm"][4:] == ("4.00", "4.00", "7.60", "8.00", "–", "–")
+    assert table.data.set_index("error").loc["miss_deg", "mean"] == 0.25
+
+
 def test_coverage_has_a_row_per_object_and_unit() -> None:
     table = coverage_table(made_up(500))
     assert [row[0] for row in table.rows] == [f"{o}, {u}" for o in ("pelvis", "femur", "device") for u in ("mm", "°")]
