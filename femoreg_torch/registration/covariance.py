@@ -37,10 +37,12 @@ from femoreg_torch.registration.intrinsics import Intrinsics, Profile, profile
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.motion import (
     GuideDrift,
+    JointTurn,
     MotionBetween,
     drifts_along_guides,
     drifts_between_views,
     motions_between,
+    turns_in_joints,
 )
 from femoreg_torch.registration.objective import image_costs, mean_quadratic
 from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, reference_point_in_view
@@ -69,6 +71,7 @@ class PoseCovariance:
     motions: tuple[MotionBetween, ...] = ()  # of the anatomy between kinds of images, were it free to move
     drifts: tuple[MotionBetween, ...] = ()  # of what other kinds of images show alone, in single views
     guide_drifts: tuple[GuideDrift, ...] = ()  # of tools in single views
+    joint_turns: tuple[JointTurn, ...] = ()  # of bones in single views
 
     def of(self, first: str, second: str | None = None) -> Tensor:
         """The block (6, 6) of one body, or of two."""
@@ -183,6 +186,7 @@ def pose_covariance(
         motions_between(scene, parts, images, objects, centres),
         drifts_between_views(scene, parts, images, objects, centres),
         drifts_along_guides(scene, poses, parts, images, objects, centres),
+        turns_in_joints(scene, parts, images, objects, centres),
     )
 
 

@@ -52,6 +52,17 @@ class MotionBetween:
 
 
 @dataclass(frozen=True)
+class JointTurn:
+    """How a bone is turned in its joint in one view, beside where its other views show it."""
+
+    view: int  # from 0
+    name: str
+    degrees: float
+    sureness: float  # the turn by its standard deviations: the most certain of its three parts
+    gain: float  # by which it lowers the cost
+
+
+@dataclass(frozen=True)
 class GuideDrift:
     """How a tool lies in one view along or about its guide, beside where its other views show it."""
 
@@ -114,6 +125,29 @@ def drifts_between_views(
         for view in views if len(views) > 1 else ():
             chosen = [each == view for _, each in images]
             found.append(MotionBetween(None, (view,), (name,), *_step(parts, chosen, _moves([n], centres))))
+    return tuple(found)
+
+
+def turns_in_joints(
+    scene: Scene, parts: Sequence[Quadratic], images: Sequence[Image], names: Sequence[str], centres: Tensor
+) -> tuple[JointTurn, ...]:
+    """Turns of every bone that starts beside the anchor, about its reference point, in one view beside the others.
+
+    A leg turns in its joint, which stays where it is: three unknowns are told more surely than the six of
+    `drifts_between_views`, of which the depth is so open. `parts`, `images`, `names` and `centres` are as for
+    `motions_between`.
+    """
+    found = []
+    views = tuple(dict.fromkeys(view for _, view in images))
+    for n, name in enumerate(names):
+        thing = scene.objects[name]
+        if thing.start.beside != scene.anchor or scene.first_kind not in thing.shown_in or len(views) < 2:
+            continue
+        moves = _moves([n], centres)[:, :3]
+        for view in views:
+            turn, deviation, gain = _step(parts, [each == view for _, each in images], moves)
+            sureness = float((turn.abs() / deviation).max())
+            found.append(JointTurn(view, name, float(turn.norm()), sureness, gain))
     return tuple(found)
 
 

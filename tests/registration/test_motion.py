@@ -12,7 +12,7 @@ from femoreg_torch.geometry import about_point, exp_se3
 from femoreg_torch.registration.covariance import pose_covariance
 from femoreg_torch.registration.doubts import doubts_about_guides, doubts_about_motion
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.motion import GuideDrift, MotionBetween
+from femoreg_torch.registration.motion import GuideDrift, JointTurn, MotionBetween
 from femoreg_torch.registration.roundness import Axis
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.similarity import GradNcc
@@ -125,7 +125,39 @@ def test_a_leg_that_turned_between_the_views_is_told() -> None:
     assert float(of_femur[2].motion[2]) == pytest.approx(3.0, abs=0.6)
 
 
-@pytest.mark.parametrize(("gain", "told"), [(0.004, 1), (0.0025, 0)])
+@pytest.mark.parametrize("degrees", [1.5, -2.0])
+def test_a_leg_that_turned_in_its_joint_is_measured(degrees: float) -> None:
+    truth = true_poses()
+    still = make_scene(truth)
+    turned = off(truth.camera1_from["femur"], REFERENCE_POINTS["femur"], (0, 0, degrees), (0, 0, 0))
+    elsewhere = make_scene(truth.with_object("femur", turned), seed=1).images
+    held = replace(still, images={kind: (*of[:2], elsewhere[kind][2]) for kind, of in still.images.items()})
+    before, found = (pose_covariance(scene, truth, _LEVEL, GradNcc(1)).joint_turns for scene in (still, held))
+    assert [(each.name, each.view) for each in found] == [("femur", 0), ("femur", 1), ("femur", 2)]
+    assert found[2].degrees == pytest.approx(abs(degrees), abs=0.4)
+    assert found[2].sureness > 3
+    assert found[2].gain == max(each.gain for each in found)
+    assert max(each.degrees for each in before) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("degrees", "sigmas", "gain", "told"),
+    [(1.3, 4.7, 0.0013, 1), (0.6, 4.7, 0.0013, 0), (1.4, 1.6, 0.0013, 0), (1.3, 4.7, 0.0005, 0)],
+)
+def test_a_turn_in_a_joint_is_told_that_is_far_and_sure_and_explains_something(
+    degrees: float, sigmas: float, gain: float, told: int
+) -> None:
+    turn = JointTurn(2, "femur", degrees, sigmas, gain)
+    covariance = replace(
+        pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)),
+        motions=(), drifts=(), guide_drifts=(), joint_turns=(turn,),
+    )  # fmt: skip
+    said = doubts_about_motion(covariance)
+    assert len(said) == told
+    assert all("in view 3, the femur is turned by 1.3° in its joint" in one for one in said)
+
+
+@pytest.mark.parametrize(("gain", "told"), [(0.005, 1), (0.0035, 0)])
 def test_a_bone_must_gain_more_than_a_device_to_have_drifted(gain: float, told: int) -> None:
     motion = torch.tensor([0.0, 0.0, 1.5, 0.9, 0.4, 0.0], dtype=torch.float64)
     drift = MotionBetween(None, (1,), ("femur",), motion, motion.abs() / 5 + 1e-9, gain)

@@ -51,13 +51,13 @@ def test_a_stage_is_what_its_keys_say() -> None:
 
 
 def test_levels_of_the_presets_are_whole_pixels_of_the_c_arm_binned_or_not() -> None:
-    """32, 16, 8 and 4 pixels of 0.194 mm."""
+    """32, 16, 8, 4 and 2 pixels of 0.194 mm."""
     camera = load_carm("cios_fusion").camera
-    levels = (6.2, 3.1, 1.55, 0.78)
+    levels = (6.2, 3.1, 1.55, 0.78, 0.39)
     steps = [step for name in OF_THE_HIP for step in load_plan(name).steps]
     used = {step.level.pixel_mm for step in steps if isinstance(step, Stage | OrbitSearch)}
     assert used == set(levels)
-    for factor, pixels in ((1, [32, 16, 8, 4]), (2, [16, 8, 4, 2]), (4, [8, 4, 2, 1])):
+    for factor, pixels in ((1, [32, 16, 8, 4, 2]), (2, [16, 8, 4, 2, 1]), (4, [8, 4, 2, 1, 1])):
         assert [binning(level, camera.downsampled(factor)) for level in levels] == pixels
 
 
@@ -100,8 +100,8 @@ def test_the_wide_preset_is_fast_with_two_more_searches_for_the_device() -> None
 
 
 def test_the_fiducial_preset_finds_the_views_by_the_device_alone() -> None:
-    *steps, last, finest = load_plan("device_fiducial").steps
-    assert (last, finest) == load_plan("fast").steps[-2:]
+    *steps, last, fine, finest = load_plan("device_fiducial").steps
+    assert (last, fine, finest) == load_plan("fast").steps[-3:]
     by_device = [step for step in steps if isinstance(step, Stage | OrbitSearch) and step.render == ["device"]]
     assert steps[: len(by_device)] == by_device
     assert [step.kinds for step in steps if isinstance(step, OrbitSearch)] == [["device"]]

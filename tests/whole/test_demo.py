@@ -28,6 +28,7 @@ steps:
   - {name: "device in all views, coarse", remove: true}
   - {name: everything together, remove: true}
   - {name: "everything together, fine", remove: true}
+  - {name: "device alone, finest", remove: true}
   - name: pelvis in view 1, coarse
     level: {pixel_mm: 6.2, step_mm: 3}
     optimiser: {kind: levenberg_marquardt, candidates: 0, max_iterations: 1}
