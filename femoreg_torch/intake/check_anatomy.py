@@ -21,7 +21,9 @@ from femoreg_torch.pnp import MINIMUM
 from femoreg_torch.registration.plan_and_landmarks import MOST_OFF_BONE_MM, MOST_OFF_HEAD_MM
 from femoreg_torch.segment import head_centre
 from femoreg_torch.volume import (
+    NOBODY,
     BoneLabels,
+    Patient,
     Volume,
     bone_labels,
     check_inside,
@@ -31,6 +33,7 @@ from femoreg_torch.volume import (
     landmarks_without_bones,
     merged_bones,
     misplaced_labels,
+    patient_of,
     read_ct_told,
     read_labels_told,
     segment_names,
@@ -50,6 +53,7 @@ class SeenAnatomy:
     bones: BoneLabels | None = None
     landmarks: Mapping[str, Tensor] = field(default_factory=dict)
     anatomy: Anatomy | None = None
+    patient: Patient = NOBODY  # of the CT, by its header
 
 
 def check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: Found) -> SeenAnatomy:
@@ -62,16 +66,16 @@ def check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: Found) -
     else:
         labels_path = found.attempt(lambda: ct.file_path("labels", folder, may_be_folder=True))
     table = found.attempt(lambda: read_bones(ct, folder, HIP)) if labels_path is not None else None
-    volume = None
+    volume, patient = None, NOBODY
     read = None if path is None else found.attempt(lambda: read_ct_told(path))
     if read is not None and path is not None:
-        volume, told = read
+        (volume, told), patient = read, patient_of(path)
         found.warnings += [*told, *header_warnings(path), *ct_warnings(volume)]
         found.facts.append(f"CT: {described(volume)}")
     bones = None
     if volume is not None and labels_path is not None and table is not None:
         bones = found.attempt(lambda: check_bones(labels_path, volume, table, HIP, marks, found))
-    return SeenAnatomy(volume, bones, marks, HIP)
+    return SeenAnatomy(volume, bones, marks, HIP, patient)
 
 
 def check_bones(

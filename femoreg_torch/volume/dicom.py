@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from femoreg_torch.arrays import opened
 from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.volume.patient import NOBODY, Patient, compared_text, patient_in
 
 _TAGS = (
     "SOPInstanceUID", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "ImageType", "Rows",
@@ -75,8 +76,8 @@ class Slice:
         return value if np.isfinite(value) else None
 
     def words(self, name: str) -> str:
-        """The text of a tag, in small letters and without the marks that end names; empty where it is missing."""
-        return str(self.header.get(name) or "").strip(" ^").casefold()
+        """The text of a tag as it is compared; empty where it is missing."""
+        return compared_text(self.header, name)
 
     def whole(self, name: str, otherwise: int) -> int:
         """The whole number of a tag."""
@@ -231,6 +232,13 @@ def choose_series(path: Path, wanted: str | None = None) -> Series:
         f"{folder}: holds {len(chosen)} DICOM series{several}, one was expected: {listed}. Choose one: by its number, "
         "its UID or a part of its name with `--series`, or by the path of one of its files in case.yaml."
     )
+
+
+def patient_of(path: Path, wanted: str | None = None) -> Patient:
+    """Whom the DICOM series that `choose_series` takes is of; of a file of another format nothing is known."""
+    if not (path.is_dir() or is_dicom(path)):
+        return NOBODY
+    return patient_in(choose_series(path, wanted).slices[0].header)
 
 
 def _listed(series: Sequence[Series]) -> str:
