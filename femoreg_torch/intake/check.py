@@ -35,6 +35,7 @@ from femoreg_torch.intake.check_anatomy import (
     check_head,
     check_landmarks,
     check_path,
+    check_slices,
     planes_of,
 )
 from femoreg_torch.intake.check_images import check_images, check_views, readable_views
@@ -114,6 +115,7 @@ def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAn
         found.unknown_keys(ct, ("image", "labels", "bones"))
         seen = check_ct(ct, folder, marks, found)
     check_landmarks(seen, found)
+    check_slices(seen, found)
     path = None
     if side is not None:
         if marks and femoral_head(side) not in marks:
@@ -237,4 +239,5 @@ def _check_written_out(case: Case, found: Found) -> tuple[SeenAnatomy, dict[str,
                 found.attempt(lambda thing=thing: bones.of(thing.bones, case.anatomy))  # type: ignore[misc]
     seen = SeenAnatomy(ct, bones, case.landmarks, case.anatomy)
     check_landmarks(seen, found)
+    check_slices(seen, found)
     return seen, images

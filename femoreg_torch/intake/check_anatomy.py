@@ -10,6 +10,7 @@ from torch import Tensor
 from femoreg_torch.anatomy import HIP, Anatomy, LabelTable
 from femoreg_torch.case import Case
 from femoreg_torch.case.femoroplasty import femoral_head, operated_femur
+from femoreg_torch.case.femoroplasty_form import SIDES
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.model import PlannedPath, Side
 from femoreg_torch.case.parts import read_bones
@@ -19,7 +20,7 @@ from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.pnp import MINIMUM
 from femoreg_torch.registration.plan_and_landmarks import MOST_OFF_BONE_MM, MOST_OFF_HEAD_MM
-from femoreg_torch.segment import head_centre
+from femoreg_torch.segment import doubted_slices, head_centre, head_of
 from femoreg_torch.volume import (
     NOBODY,
     BoneLabels,
@@ -145,6 +146,15 @@ def _of_few(seen: SeenAnatomy) -> str:
     names = [] if seen.anatomy is None else seen.anatomy.landmark_names
     missing = [name for name in names if name not in seen.landmarks]
     return f"{means}. Place more of {', '.join(missing)}" if missing else means
+
+
+def check_slices(seen: SeenAnatomy, found: Found) -> None:
+    """Femoral heads are as long from head to foot as across."""
+    if seen.bones is not None:
+        marks = {side: seen.landmarks.get(femoral_head(side)) for side in SIDES}
+        heads = [head_of(seen.bones, side, near) for side, near in marks.items()]
+        spacing_mm = seen.bones.labels.spacing_mm
+        found.warnings += doubted_slices([head for head in heads if head is not None], spacing_mm)
 
 
 def check_head(side: Side, seen: SeenAnatomy, found: Found) -> None:

@@ -40,7 +40,7 @@ from femoreg_torch.fluoro import (
     without_penumbra,
 )
 from femoreg_torch.registration.models import ModelVolumes, model_attenuation, told_of_middle
-from femoreg_torch.registration.plan_and_landmarks import doubts_about_the_files
+from femoreg_torch.registration.plan_and_landmarks import doubts_about_the_files, notes_on_the_slices
 from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.registration.silhouette import outline_of
@@ -91,6 +91,7 @@ def prepare_scene(case: Case) -> Scene:
             ct, bones = read_bones(case)
             outlining = beside.submit(outline_of, bones, case.anatomy)
             framing = beside.submit(doubts_about_the_files, case, ct, bones)
+            rounding = beside.submit(notes_on_the_slices, case, bones)
             check_inside(case.landmarks, ct)
             told_of_ct = (*bones.notes, *_check_anatomy(case, ct, bones))
             _check_path(case, ct)
@@ -98,7 +99,7 @@ def prepare_scene(case: Case) -> Scene:
             tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
         images, fields, bright, told = reading.result()
         if from_ct:
-            told = (*told_of_ct, *told)
+            told = (*told_of_ct, *rounding.result(), *told)
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
             outline, contradictions = outlining.result(), framing.result()
         made = {name: model.result() for name, model in making.items()}
