@@ -38,6 +38,7 @@ from femoreg_torch.volume import (
     read_ct_told,
     read_labels_told,
     segment_names,
+    soft_bones,
     stray_landmarks,
     swapped_sides,
 )
@@ -93,8 +94,8 @@ def check_bones(
         found.warnings.append(seen.light)
     elif (misplaced := misplaced_labels(ct, bones.labels, list(bones.ids.values()))) is not None:
         found.warnings.append(misplaced)
-    elif seen.elsewhere is not None:
-        found.warnings.append(seen.elsewhere)
+    elif (elsewhere := seen.elsewhere or soft_bones(ct, bones.labels, bones.ids)) is not None:
+        found.warnings.append(elsewhere)
     found.facts.append(f"bones: {', '.join(bones.ids)}")
     names = [name for name, ids in segment_names(path).items() if not wanted & set(ids)] if has_names(path) else []
     if names:

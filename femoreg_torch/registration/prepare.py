@@ -60,6 +60,7 @@ from femoreg_torch.volume import (
     read_ct_told,
     read_labels_told,
     resample_isotropic,
+    soft_bones,
     structure_attenuation,
     swapped_sides,
 )
@@ -147,7 +148,8 @@ def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]
     seen = densities(ct, bones.labels)
     if wrong := [*told, *filter(None, [seen.unscaled])]:
         raise InputError(f"{case.folder}: {'; '.join(wrong)}.")
-    return (*filter(None, [seen.light, seen.elsewhere]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
+    elsewhere = seen.light or seen.elsewhere or soft_bones(ct, bones.labels, bones.ids)
+    return (*filter(None, [elsewhere]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
 
 
 def _check_path(case: Case, ct: Volume) -> None:

@@ -2,7 +2,7 @@
 
 from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
 from femoreg_torch.volume.bones import BoneLabels, bone_labels
-from femoreg_torch.volume.contradictions import densities, misplaced_labels, shifted_labels
+from femoreg_torch.volume.contradictions import densities, misplaced_labels, shifted_labels, soft_bones
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
 from femoreg_torch.volume.dicom import patient_of
 from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
@@ -80,6 +80,7 @@ __all__ = [
     "segment_names",
     "sharpened",
     "shifted_labels",
+    "soft_bones",
     "solid_volumes",
     "stray_landmarks",
     "structure_attenuation",

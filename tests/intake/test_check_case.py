@@ -15,7 +15,7 @@ import torch
 import trimesh
 from intake_files import HEAD, case_content, landmarks, markups, ras_affine, write_content, write_files
 
-from femoreg_torch.anatomy import HIP, load_anatomy
+from femoreg_torch.anatomy import HIP, label_table, load_anatomy
 from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
@@ -602,6 +602,21 @@ def test_bones_as_light_as_foam_are_a_warning(files: Path, tmp_path: Path) -> No
     assert checked.problems == ()
     assert any(told in warning for warning in checked.warnings)
     assert any(told in note for note in prepare_scene(read_case(folder)).missing)
+
+
+def test_a_bone_of_soft_tissue_is_told_by_check_and_registration(files: Path, tmp_path: Path) -> None:
+    """Its id is that of a muscle: the label of the sacrum is given to what lies in front of it."""
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    write_content(folder, case_content())
+    image = nibabel.load(folder / "labels.nii.gz")
+    values = np.asarray(image.dataobj)
+    number = label_table("femoreg")["sacrum"][0]
+    muscle = np.where(values == number, 0, values)
+    muscle[np.roll(values == number, 20, 1) & (muscle == 0)] = number
+    nibabel.save(nibabel.Nifti1Image(muscle, ras_affine()), folder / "labels.nii.gz")
+    for notes in (check_case(folder, find_start=False).warnings, prepare_scene(read_case(folder)).missing):
+        assert sum(note.startswith("label map: sacrum (40 and") for note in notes) == 1
 
 
 def warned(folder: Path, content: Content) -> str:
