@@ -33,9 +33,9 @@ from femoreg_torch.intake.check_anatomy import (
     check_bones,
     check_ct,
     check_head,
+    check_heads,
     check_landmarks,
     check_path,
-    check_slices,
     planes_of,
 )
 from femoreg_torch.intake.check_images import check_images, check_views, readable_views
@@ -115,7 +115,7 @@ def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAn
         found.unknown_keys(ct, ("image", "labels", "bones"))
         seen = check_ct(ct, folder, marks, found)
     check_landmarks(seen, found)
-    check_slices(seen, found)
+    check_heads(seen, found)
     path = None
     if side is not None:
         if marks and femoral_head(side) not in marks:
@@ -239,5 +239,5 @@ def _check_written_out(case: Case, found: Found) -> tuple[SeenAnatomy, dict[str,
                 found.attempt(lambda thing=thing: bones.of(thing.bones, case.anatomy))  # type: ignore[misc]
     seen = SeenAnatomy(ct, bones, case.landmarks, case.anatomy)
     check_landmarks(seen, found)
-    check_slices(seen, found)
+    check_heads(seen, found)
     return seen, images

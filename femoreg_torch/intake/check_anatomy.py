@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -20,7 +21,7 @@ from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.pnp import MINIMUM
 from femoreg_torch.registration.plan_and_landmarks import MOST_OFF_BONE_MM, MOST_OFF_HEAD_MM
-from femoreg_torch.segment import doubted_slices, head_centre, head_of
+from femoreg_torch.segment import Head, doubted_radius, doubted_slices, head_of
 from femoreg_torch.volume import (
     NOBODY,
     BoneLabels,
@@ -56,6 +57,12 @@ class SeenAnatomy:
     landmarks: Mapping[str, Tensor] = field(default_factory=dict)
     anatomy: Anatomy | None = None
     patient: Patient = NOBODY  # of the CT, by its header
+
+    @cached_property
+    def heads(self) -> dict[Side, Head]:
+        """By side, the spheres that fit the femoral heads of the bones."""
+        fitted = {} if self.bones is None else {side: head_of(self.bones, side) for side in SIDES}
+        return {side: head for side, head in fitted.items() if head is not None}
 
 
 def check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: Found) -> SeenAnatomy:
@@ -149,24 +156,24 @@ def _of_few(seen: SeenAnatomy) -> str:
     return f"{means}. Place more of {', '.join(missing)}" if missing else means
 
 
-def check_slices(seen: SeenAnatomy, found: Found) -> None:
-    """Femoral heads are as long from head to foot as across."""
-    if seen.bones is not None:
-        marks = {side: seen.landmarks.get(femoral_head(side)) for side in SIDES}
-        heads = [head_of(seen.bones, side, near) for side, near in marks.items()]
-        spacing_mm = seen.bones.labels.spacing_mm
-        found.warnings += doubted_slices([head for head in heads if head is not None], spacing_mm)
+def check_heads(seen: SeenAnatomy, found: Found) -> None:
+    """Femoral heads are as large as those of adults, and as long from head to foot as across."""
+    if seen.bones is None:
+        return
+    for side, head in seen.heads.items():
+        found.warnings += doubted_radius(side, head.radius_mm) if head.is_round else []
+    found.warnings += doubted_slices(seen.heads.values(), seen.bones.labels.spacing_mm)
 
 
 def check_head(side: Side, seen: SeenAnatomy, found: Found) -> None:
     """The operated femoral head, which paths end in, lies in the middle of the sphere that fits the bone's."""
     name = femoral_head(side)
-    centre = None if seen.bones is None or name not in seen.landmarks else head_centre(seen.bones, side)
-    if centre is None:
+    head = seen.heads.get(side)
+    if head is None or not (head.may_be_one and head.is_round) or name not in seen.landmarks:
         return
-    off = float((centre - seen.landmarks[name]).norm())
+    off = float((head.centre - seen.landmarks[name]).norm())
     if off > MOST_OFF_HEAD_MM:
-        where = ", ".join(f"{v:.1f}" for v in centre.tolist())
+        where = ", ".join(f"{v:.1f}" for v in head.centre.tolist())
         found.warnings.append(
             f"landmarks: {name} lies {off:.0f} mm from the middle of the sphere that fits the femoral head of the "
             f"label map, ({where}) mm LPS: look at it"

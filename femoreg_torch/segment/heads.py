@@ -42,6 +42,11 @@ class Head:
         """Whether a head may be so large; other spheres are fitted to something else."""
         return HEAD_RADIUS_MM[0] <= self.radius_mm <= HEAD_RADIUS_MM[1]
 
+    @property
+    def is_round(self) -> bool:
+        """Whether the surface in the socket is that of a sphere."""
+        return self.residual_mm <= DOUBTED_RESIDUAL_MM
+
 
 def fitted_heads(labels: Volume, ids: Mapping[str, int]) -> dict[str, Head]:
     """By side, the sphere that fits the head of a femur, where the femur and its hip bone are among the `ids`."""
@@ -58,20 +63,19 @@ def fitted_heads(labels: Volume, ids: Mapping[str, int]) -> dict[str, Head]:
 
 
 def head_of(bones: BoneLabels, side: str, near: Tensor | None = None) -> Head | None:
-    """The femoral head of a side; None where bones are missing, or what fits is no head.
+    """The sphere that fits the femoral head of a side, whether or not it may be one; None where bones are missing.
 
     With a point (3,), LPS mm, `near` it, it is looked for within 40 mm along each axis alone, which is faster.
     """
     labels = bones.labels if near is None else _around(bones.labels, near)
     wanted = {name: n for name, n in bones.ids.items() if name.endswith(side) and (labels.data == n).any()}
-    head = fitted_heads(labels, wanted).get(side)
-    return head if head and head.may_be_one else None
+    return fitted_heads(labels, wanted).get(side)
 
 
 def head_centre(bones: BoneLabels, side: str, near: Tensor | None = None) -> Tensor | None:
     """Centre (3,), LPS mm, of the sphere that fits the head as by `head_of`; None where it is no sphere."""
     head = head_of(bones, side, near)
-    return head.centre if head and head.residual_mm <= DOUBTED_RESIDUAL_MM else None
+    return head.centre if head and head.may_be_one and head.is_round else None
 
 
 def doubted_slices(heads: Iterable[Head], spacing_mm: Sequence[float]) -> list[str]:
@@ -94,7 +98,8 @@ def doubted_slices(heads: Iterable[Head], spacing_mm: Sequence[float]) -> list[s
     return [
         f"{which} of the label map measure{'s' * (len(found) == 1)} {abs(100 * mean):.0f} % "
         f"{'more' if mean > 0 else 'less'} across the slices than within them, and heads are round: are the slices of "
-        f"the CT {spacing_mm[2]:.3g} mm apart, as its header says? A deformed head, or labels that bulge, look so too"
+        f"the CT {spacing_mm[2]:.3g} mm apart, as its header says? If not, export it anew. A deformed head, or labels "
+        "that bulge, look so too"
     ]
 
 

@@ -20,11 +20,11 @@ from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 from femoreg_torch.intake import check_case
-from femoreg_torch.intake.check_anatomy import SeenAnatomy, check_landmarks
+from femoreg_torch.intake.check_anatomy import SeenAnatomy, check_heads, check_landmarks
 from femoreg_torch.intake.found import Found
 from femoreg_torch.intake.volumes import ct_warnings
 from femoreg_torch.registration import prepare_scene
-from femoreg_torch.volume import Volume, axis_aligned, read_ct, read_label_map
+from femoreg_torch.volume import BoneLabels, Volume, axis_aligned, read_ct, read_label_map
 from femoreg_torch.volume.bones import nearest_voxel
 
 PLANES_PX = 315  # of three planes of that CT: 60 voxels of 4 mm high, 420 pixels for 80 of them
@@ -617,6 +617,25 @@ def test_a_bone_of_soft_tissue_is_told_by_check_and_registration(files: Path, tm
     nibabel.save(nibabel.Nifti1Image(muscle, ras_affine()), folder / "labels.nii.gz")
     for notes in (check_case(folder, find_start=False).warnings, prepare_scene(read_case(folder)).missing):
         assert sum(note.startswith("label map: sacrum (40 and") for note in notes) == 1
+
+
+@pytest.mark.parametrize(
+    ("scale", "told"),
+    [
+        ((1.0, 1.0, 1.0), []),
+        ((1.6, 1.6, 1.6), ["the left femoral head has a radius", "the right femoral head has a radius"]),
+        ((1.0, 1.0, 1.3), ["both femoral heads of the label map measure"]),
+    ],
+)
+def test_heads_that_are_too_large_or_too_long_are_told(files: Path, scale: tuple[float, ...], told: list[str]) -> None:
+    """As where the voxels are not as large as the header says."""
+    table = label_table("femoreg")
+    labels = read_label_map(files / "labels.nii.gz")
+    scaled = torch.diag(torch.tensor([*scale, 1.0], dtype=torch.float64)) @ labels.lps_from_index
+    found = Found()
+    bones = BoneLabels(Volume(labels.data, scaled), {name: ids[0] for name, ids in table.items()})
+    check_heads(SeenAnatomy(bones=bones, anatomy=HIP), found)
+    assert [warning[: len(start)] for warning, start in zip(found.warnings, told, strict=True)] == told
 
 
 def warned(folder: Path, content: Content) -> str:
