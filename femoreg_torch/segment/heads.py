@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import transform_points
 from femoreg_torch.segment.rules import SIDES, femoral_head
 from femoreg_torch.segment.sphere import stretch_along
@@ -55,8 +56,11 @@ def fitted_heads(labels: Volume, ids: Mapping[str, int]) -> dict[str, Head]:
     for side in SIDES:
         femur, hip = f"femur_{side}", f"hip_{side}"
         if femur in ids and hip in ids:
-            surface = bone_surface(labels, ids[femur])
-            sphere, residual = femoral_head(surface, bone_surface(labels, ids[hip]))
+            try:
+                surface, socket = (bone_surface(labels, ids[bone]) for bone in (femur, hip))
+            except InputError:  # a sliver of a bone has no head
+                continue
+            sphere, residual = femoral_head(surface, socket)
             stretch = stretch_along(surface.vertices, sphere, axis)
             heads[side] = Head(torch.from_numpy(sphere[:3].copy()), float(sphere[3]), residual, stretch)
     return heads

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -636,6 +637,29 @@ def test_heads_that_are_too_large_or_too_long_are_told(files: Path, scale: tuple
     bones = BoneLabels(Volume(labels.data, scaled), {name: ids[0] for name, ids in table.items()})
     check_heads(SeenAnatomy(bones=bones, anatomy=HIP), found)
     assert [warning[: len(start)] for warning, start in zip(found.warnings, told, strict=True)] == told
+
+
+@pytest.mark.parametrize(
+    ("scale", "told"),
+    [(0.1, ["that is 32 mm long at most", "left femoral head has a radius of 2.1 mm"]), (0.02, ["that is 6 mm long"])],
+)
+def test_a_hip_of_no_size_is_told_by_its_size(files: Path, tmp_path: Path, scale: float, told: list[str]) -> None:
+    """As in cm, or less: too small for the surface of a bone, which had ended in a traceback."""
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    for name in ("ct.nii.gz", "labels.nii.gz"):
+        image = nibabel.load(folder / name)
+        smaller = np.diag([scale, scale, scale, 1]) @ ras_affine()
+        nibabel.save(nibabel.Nifti1Image(np.asarray(image.dataobj), smaller), folder / name)
+    marks = {name: tuple(scale * v for v in point) for name, point in landmarks().items()}
+    (folder / "landmarks.mrk.json").write_text(markups(marks), encoding="utf-8")
+    content = case_content()
+    content["plan"]["entry_point"] = [scale * v for v in content["plan"]["entry_point"]]
+    write_content(folder, content)
+    warnings = check_case(folder, find_start=False).warnings
+    assert all(any(words in warning for warning in warnings) for words in told)
+    with suppress(InputError):  # the smaller one, of which nothing is left on voxels of 1 mm
+        prepare_scene(read_case(folder))
 
 
 def warned(folder: Path, content: Content) -> str:
