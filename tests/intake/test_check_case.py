@@ -662,6 +662,19 @@ def test_a_hip_of_no_size_is_told_by_its_size(files: Path, tmp_path: Path, scale
         prepare_scene(read_case(folder))
 
 
+def test_vertebrae_that_a_ct_does_not_show_are_no_warning(files: Path, tmp_path: Path) -> None:
+    """A hip bone that nobody labelled is one."""
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    write_content(folder, case_content())
+    relabelled({}, folder, label_table("femoreg")["hip_right"][0], 0)
+    found = check_case(folder, find_start=False)
+    assert "not in labels.nii.gz: vertebrae" in found.facts
+    absent = [warning for warning in found.warnings if "no voxel of" in warning]
+    assert len(absent) == 1
+    assert "the hip_right: nothing is lost if the CT shows none" in absent[0]
+
+
 def warned(folder: Path, content: Content) -> str:
     write_content(folder, content)
     checked = check_case(folder, find_start=False)
