@@ -85,8 +85,8 @@ def head_centre(bones: BoneLabels, side: str, near: Tensor | None = None) -> Ten
 def doubted_slices(heads: Iterable[Head], spacing_mm: Sequence[float]) -> list[str]:
     """A warning where heads, which are round, are longer or shorter along the slices' normal than anatomy explains.
 
-    `spacing_mm` (3,) is that of the label map, as x, y, z. A CT whose slices are told to lie 5 % and more too far apart
-    or too close is found so.
+    `spacing_mm` (3,) is that of the label map, as x, y, z. Of CTs whose slices are told to lie 6 % too far apart or too
+    close most are found so.
     """
     found = [head for head in heads if head.may_be_one and math.isfinite(head.stretch)]
     if not found:
