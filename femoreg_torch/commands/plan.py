@@ -149,12 +149,13 @@ def plan_robustness(
     import numpy as np
     from rich.console import Console
 
+    from femoreg_torch.case import RESULT_NAME, read_case
     from femoreg_torch.commands.telling import progress_report, tell_device
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import write_json
     from femoreg_torch.planning.diffusion import NoMarrowError
     from femoreg_torch.planning.figures import robustness_figure, save
-    from femoreg_torch.planning.offsets import normal_moves, read_covariance, study_moves
+    from femoreg_torch.planning.offsets import check_run, normal_moves, read_covariance, study_moves
     from femoreg_torch.planning.replan import Replan
     from femoreg_torch.planning.report import read_plan
 
@@ -173,6 +174,8 @@ def plan_robustness(
     else:
         assert covariance is not None  # one of the two
         variance = read_covariance(covariance)
+        if covariance.name == RESULT_NAME:
+            check_run(covariance, read_case(case or stored.case), stored.side)
         moves = normal_moves(np.zeros(len(variance)) if mean is None else np.array(mean), variance, count, seed)
     again = Replan(plan, case, tell_device(console, device))
     with progress_report(console, "draws") as report:

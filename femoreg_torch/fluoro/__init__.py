@@ -27,6 +27,7 @@ from femoreg_torch.fluoro.reading import (
 )
 from femoreg_torch.fluoro.saturation import saturated
 from femoreg_torch.fluoro.tags import Tags, check_header, contradictions, nearest_side
+from femoreg_torch.fluoro.together import Exposure, other_patient, told_together
 
 __all__ = [
     "SOURCES",
@@ -34,6 +35,7 @@ __all__ = [
     "Circle",
     "Display",
     "Distortion",
+    "Exposure",
     "Frames",
     "GridImage",
     "Polygon",
@@ -60,6 +62,7 @@ __all__ = [
     "natural",
     "nearest_side",
     "nearest_source",
+    "other_patient",
     "raised",
     "read_header",
     "read_image",
@@ -67,6 +70,7 @@ __all__ = [
     "saturated",
     "settled_intensity",
     "shades",
+    "told_together",
     "without_defects",
     "without_penumbra",
     "write_image",

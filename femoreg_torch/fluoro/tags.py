@@ -7,7 +7,9 @@ pixel spacing (0018,1164); (0028,0030) may be scaled to any plane in the patient
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro.display import Display, Source
 from femoreg_torch.fluoro.field import Circle, Overlap, Polygon
 from femoreg_torch.geometry import Camera, Uncertainty
+from femoreg_torch.volume.patient import NOBODY, Patient, patient_in
 
 _NEAR_DEG = 75.0  # of a source from the middle of its side: half an orbit search, and a patient who lies askew
 _VIEWS = {"AP": 0.0, "PA": 180.0}
@@ -37,6 +40,10 @@ class Tags:
     orientation: tuple[str, str] | None = None  # where rows, and columns, of the picture lead: L, R, A, P, H or F
     field: Circle | Polygon | Overlap | None = None  # what shutters and collimators leave
     flipped: bool | None = None  # whether the picture is a mirror image of what the detector read
+    patient: Patient = NOBODY
+    instance: str = ""  # SOPInstanceUID
+    arm_deg: tuple[float, float] | None = None  # primary and secondary angle of an arm that stood still
+    taken: datetime | None = None
 
     def display(self, source: Source) -> Display | None:
         """How the picture shows a patient whose source stands on that side, if the orientation tells it."""
@@ -81,6 +88,10 @@ def read_tags(dataset: Any) -> Tags:
         orientation=_orientation(dataset),
         field=_field(dataset, shape),
         flipped={"YES": True, "NO": False}.get(str(find_value(dataset, "FieldOfViewHorizontalFlip"))),
+        patient=patient_in(dataset),
+        instance=str(dataset.get("SOPInstanceUID") or ""),
+        arm_deg=_arm(dataset),
+        taken=_taken(dataset),
     )
 
 
@@ -121,12 +132,38 @@ def _numbers(dataset: Any, keyword: str, count: int) -> list[float] | None:
     return numbers
 
 
+def _taken(dataset: Any) -> datetime | None:
+    """When an image was taken, to the second."""
+    whole = str(dataset.get("AcquisitionDateTime") or "")
+    parts = (f"{dataset.get(f'{of}Date') or ''}{dataset.get(f'{of}Time') or ''}" for of in ("Acquisition", "Content"))
+    for text in (whole, *parts):
+        with suppress(ValueError):  # of a day without a time, or of something else
+            return datetime.strptime(text[:14], "%Y%m%d%H%M%S")  # that of the C-arm's own clock
+    return None
+
+
+def _moved(dataset: Any) -> bool:
+    """Whether the arm moved during a run, and the header does not tell its angles of each frame."""
+    return dataset.get("PositionerMotion") == "DYNAMIC" and not dataset.get("PerFrameFunctionalGroupsSequence")
+
+
+def _arm(dataset: Any) -> tuple[float, float] | None:
+    """Primary and secondary angle of the positioner, degrees."""
+    if _moved(dataset):
+        return None
+    for of in ("Positioner", "PositionerIsocenter"):
+        angles = [_numbers(dataset, f"{of}{which}Angle", 1) for which in ("Primary", "Secondary")]
+        if angles[0] is not None and angles[1] is not None:
+            return angles[0][0], angles[1][0]
+    return None
+
+
 def _source(dataset: Any) -> float | None:
     """Where the source stands about the patient, degrees: from the positioner's angle, or from the view's name.
 
     Of a run during which the arm moved these tell where it began, unless they are told of each frame.
     """
-    if dataset.get("PositionerMotion") == "DYNAMIC" and not dataset.get("PerFrameFunctionalGroupsSequence"):
+    if _moved(dataset):
         return None
     primary = _numbers(dataset, "PositionerPrimaryAngle", 1) or _numbers(dataset, "PositionerIsocenterPrimaryAngle", 1)
     if primary is None:
@@ -251,7 +288,7 @@ def _other_camera(tags: Tags, camera: Camera, uncertainty: Uncertainty | None) -
 
 
 def _other_side(tags: Tags, display: Display) -> Iterator[str]:
-    if tags.source_deg is not None and _apart(tags.source_deg, _SIDES[display.source]) > _NEAR_DEG:
+    if tags.source_deg is not None and apart_deg(tags.source_deg, _SIDES[display.source]) > _NEAR_DEG:
         side = nearest_side(tags.source_deg)
         has = "takes it for anterior, as nothing is said" if display == Display() else f"says {display.source}"
         yield (
@@ -279,9 +316,9 @@ def _unless(display: Display) -> str:
 
 def nearest_side(source_deg: float) -> Source:
     """The side of the patient that a source stands on, by its angle from the front to the patient's left."""
-    return min(_SIDES, key=lambda name: _apart(source_deg, _SIDES[name]))
+    return min(_SIDES, key=lambda name: apart_deg(source_deg, _SIDES[name]))
 
 
-def _apart(a_deg: float, b_deg: float) -> float:
+def apart_deg(a_deg: float, b_deg: float) -> float:
     """The angle between two directions, degrees."""
     return abs((a_deg - b_deg + 180) % 360 - 180)

@@ -33,6 +33,7 @@ from femoreg_torch.intake.check_anatomy import (
     check_bones,
     check_ct,
     check_head,
+    check_heads,
     check_landmarks,
     check_path,
     planes_of,
@@ -50,7 +51,7 @@ from femoreg_torch.registration.models import (
     told_of_leaning,
     told_of_middle,
 )
-from femoreg_torch.volume import is_in_ras, read_ct_told, read_landmarks
+from femoreg_torch.volume import NOBODY, is_in_ras, patient_of, read_ct_told, read_landmarks
 from femoreg_torch.volume.borders import cut_bones
 from femoreg_torch.volume.round_field import round_field
 
@@ -114,6 +115,7 @@ def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAn
         found.unknown_keys(ct, ("image", "labels", "bones"))
         seen = check_ct(ct, folder, marks, found)
     check_landmarks(seen, found)
+    check_heads(seen, found)
     path = None
     if side is not None:
         if marks and femoral_head(side) not in marks:
@@ -133,7 +135,7 @@ def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAn
             check_path(path, side, seen, found)
     if DEVICE in top:
         _check_device(top, folder, path, side, found)
-    images = check_views(top, folder, carm, display, found)
+    images = check_views(top, folder, carm, display, seen.patient, found)
     if "truth" in top:
         names = [PELVIS, FEMUR, *([DEVICE] if DEVICE in top else [])]
         count = len(found.attempt(lambda: top.mappings("views")) or ())
@@ -211,7 +213,9 @@ def _device_points(device: Fields, folder: Path, found: Found) -> dict[str, Tens
 
 def _check_written_out(case: Case, found: Found) -> tuple[SeenAnatomy, dict[str, Tensor]]:
     """What can be seen of a case that could be read, of any form; also its images, by key."""
-    images = check_images(case, found)
+    ct_path = case.ct_path
+    patient = None if ct_path is None else found.attempt(lambda: patient_of(ct_path))
+    images = check_images(case, patient or NOBODY, found)
     for thing in case.objects.values():
         if thing.model is not None:
             model = found.attempt(lambda thing=thing: model_attenuation(thing.model))  # type: ignore[misc]
@@ -219,13 +223,13 @@ def _check_written_out(case: Case, found: Found) -> tuple[SeenAnatomy, dict[str,
                 found.warnings += [
                     line for tell in _TOLD_OF_GUIDES for line in tell(thing.name, model.volume, thing.points)
                 ]
-    if case.ct_path is None or case.labels_path is None:
+    if ct_path is None or case.labels_path is None:
         return SeenAnatomy(landmarks=case.landmarks, anatomy=case.anatomy), images
-    read = found.attempt(lambda: read_ct_told(cast(Path, case.ct_path)))
+    read = found.attempt(lambda: read_ct_told(ct_path))
     if read is None:
         return SeenAnatomy(landmarks=case.landmarks, anatomy=case.anatomy), images
     ct, told = read
-    found.warnings += [*told, *header_warnings(case.ct_path), *ct_warnings(ct)]
+    found.warnings += [*told, *header_warnings(ct_path), *ct_warnings(ct)]
     found.facts.append(f"CT: {described(ct)}")
     labels_path = case.labels_path
     bones = found.attempt(lambda: check_bones(labels_path, ct, case.bones, case.anatomy, case.landmarks, found))
@@ -235,4 +239,5 @@ def _check_written_out(case: Case, found: Found) -> tuple[SeenAnatomy, dict[str,
                 found.attempt(lambda thing=thing: bones.of(thing.bones, case.anatomy))  # type: ignore[misc]
     seen = SeenAnatomy(ct, bones, case.landmarks, case.anatomy)
     check_landmarks(seen, found)
+    check_heads(seen, found)
     return seen, images

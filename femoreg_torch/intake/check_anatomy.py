@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from femoreg_torch.anatomy import HIP, Anatomy, LabelTable
 from femoreg_torch.case import Case
 from femoreg_torch.case.femoroplasty import femoral_head, operated_femur
+from femoreg_torch.case.femoroplasty_form import SIDES
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.case.model import PlannedPath, Side
 from femoreg_torch.case.parts import read_bones
@@ -19,9 +21,11 @@ from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.pnp import MINIMUM
 from femoreg_torch.registration.plan_and_landmarks import MOST_OFF_BONE_MM, MOST_OFF_HEAD_MM
-from femoreg_torch.segment import head_centre
+from femoreg_torch.segment import Head, doubted_radius, doubted_slices, head_of
 from femoreg_torch.volume import (
+    NOBODY,
     BoneLabels,
+    Patient,
     Volume,
     bone_labels,
     check_inside,
@@ -31,9 +35,11 @@ from femoreg_torch.volume import (
     landmarks_without_bones,
     merged_bones,
     misplaced_labels,
+    patient_of,
     read_ct_told,
     read_labels_told,
     segment_names,
+    soft_bones,
     stray_landmarks,
     swapped_sides,
 )
@@ -50,6 +56,13 @@ class SeenAnatomy:
     bones: BoneLabels | None = None
     landmarks: Mapping[str, Tensor] = field(default_factory=dict)
     anatomy: Anatomy | None = None
+    patient: Patient = NOBODY  # of the CT, by its header
+
+    @cached_property
+    def heads(self) -> dict[Side, Head]:
+        """By side, the spheres that fit the femoral heads of the bones."""
+        fitted = {} if self.bones is None else {side: head_of(self.bones, side) for side in SIDES}
+        return {side: head for side, head in fitted.items() if head is not None}
 
 
 def check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: Found) -> SeenAnatomy:
@@ -62,16 +75,16 @@ def check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: Found) -
     else:
         labels_path = found.attempt(lambda: ct.file_path("labels", folder, may_be_folder=True))
     table = found.attempt(lambda: read_bones(ct, folder, HIP)) if labels_path is not None else None
-    volume = None
+    volume, patient = None, NOBODY
     read = None if path is None else found.attempt(lambda: read_ct_told(path))
     if read is not None and path is not None:
-        volume, told = read
+        (volume, told), patient = read, patient_of(path)
         found.warnings += [*told, *header_warnings(path), *ct_warnings(volume)]
         found.facts.append(f"CT: {described(volume)}")
     bones = None
     if volume is not None and labels_path is not None and table is not None:
         bones = found.attempt(lambda: check_bones(labels_path, volume, table, HIP, marks, found))
-    return SeenAnatomy(volume, bones, marks, HIP)
+    return SeenAnatomy(volume, bones, marks, HIP, patient)
 
 
 def check_bones(
@@ -88,17 +101,20 @@ def check_bones(
         found.warnings.append(seen.light)
     elif (misplaced := misplaced_labels(ct, bones.labels, list(bones.ids.values()))) is not None:
         found.warnings.append(misplaced)
-    elif seen.elsewhere is not None:
-        found.warnings.append(seen.elsewhere)
+    elif (elsewhere := seen.elsewhere or soft_bones(ct, bones.labels, bones.ids)) is not None:
+        found.warnings.append(elsewhere)
     found.facts.append(f"bones: {', '.join(bones.ids)}")
     names = [name for name, ids in segment_names(path).items() if not wanted & set(ids)] if has_names(path) else []
     if names:
         found.facts.append(f"parts of {path.name} that are taken for no bone: {some_of(names)}")
     for bone, ids in bones.absent.items():
         numbers = ", ".join(map(str, ids))
-        found.warnings.append(
-            f"no voxel of {path.name} carries the label {numbers}, the {bone}: nothing is lost if the CT shows none"
-        )
+        if anatomy is None or anatomy.landmarks_of(bone):
+            found.warnings.append(
+                f"no voxel of {path.name} carries the label {numbers}, the {bone}: nothing is lost if the CT shows none"
+            )
+        else:  # vertebrae and sacrum: few CTs of a hip show all that a table names
+            found.facts.append(f"not in {path.name}: {bone}")
     return bones
 
 
@@ -143,15 +159,24 @@ def _of_few(seen: SeenAnatomy) -> str:
     return f"{means}. Place more of {', '.join(missing)}" if missing else means
 
 
+def check_heads(seen: SeenAnatomy, found: Found) -> None:
+    """Femoral heads are as large as those of adults, and as long from head to foot as across."""
+    if seen.bones is None:
+        return
+    for side, head in seen.heads.items():
+        found.warnings += doubted_radius(side, head.radius_mm) if head.is_round else []
+    found.warnings += doubted_slices(seen.heads.values(), seen.bones.labels.spacing_mm)
+
+
 def check_head(side: Side, seen: SeenAnatomy, found: Found) -> None:
     """The operated femoral head, which paths end in, lies in the middle of the sphere that fits the bone's."""
     name = femoral_head(side)
-    centre = None if seen.bones is None or name not in seen.landmarks else head_centre(seen.bones, side)
-    if centre is None:
+    head = seen.heads.get(side)
+    if head is None or not (head.may_be_one and head.is_round) or name not in seen.landmarks:
         return
-    off = float((centre - seen.landmarks[name]).norm())
+    off = float((head.centre - seen.landmarks[name]).norm())
     if off > MOST_OFF_HEAD_MM:
-        where = ", ".join(f"{v:.1f}" for v in centre.tolist())
+        where = ", ".join(f"{v:.1f}" for v in head.centre.tolist())
         found.warnings.append(
             f"landmarks: {name} lies {off:.0f} mm from the middle of the sphere that fits the femoral head of the "
             f"label map, ({where}) mm LPS: look at it"

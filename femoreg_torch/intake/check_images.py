@@ -26,6 +26,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import (
     Circle,
     Display,
+    Exposure,
     GridImage,
     Polygon,
     below_zero,
@@ -33,15 +34,18 @@ from femoreg_torch.fluoro import (
     check_intensity,
     check_matches,
     find_distortion,
+    other_patient,
     raised,
     read_image,
     read_stored,
     settled_intensity,
+    told_together,
 )
 from femoreg_torch.fluoro.reading import LOOKS_LOG
 from femoreg_torch.geometry import Camera, CArm
 from femoreg_torch.intake.exchanged import kinds_exchanged, rough_attenuation, views_exchanged
 from femoreg_torch.intake.found import Found
+from femoreg_torch.volume import Patient
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +54,7 @@ class _Seen:
 
     values: Tensor  # (H, W)
     attenuation: Tensor | None  # (H, W)
+    exposure: Exposure | None  # what the header of a DICOM file says
 
 
 def readable_views(top: Fields, folder: Path) -> list[View]:
@@ -68,11 +73,11 @@ def readable_views(top: Fields, folder: Path) -> list[View]:
 
 
 def check_views(
-    top: Fields, folder: Path, carm: CArm | None, display: Display | None, found: Found
+    top: Fields, folder: Path, carm: CArm | None, display: Display | None, patient: Patient, found: Found
 ) -> dict[str, Tensor]:
     """Every view of the short form by itself. Without a C-arm or display its images are looked at by themselves.
 
-    Returns the images (H, W) that could be read, by key.
+    `patient` is that of the CT. Returns the images (H, W) that could be read, by key.
     """
     views = found.attempt(lambda: top.mappings("views"))
     if views is None:
@@ -81,7 +86,7 @@ def check_views(
         found.problem(f"{top.where('views')}: empty. At least one fluoroscopic image is needed.")
     read: dict[str, _Seen] = {}
     poses: dict[str, Tensor] = {}
-    for view in views:
+    for number, view in enumerate(views):
         found.unknown_keys(view, (ANATOMY_IMAGES, DEVICE_IMAGES, *VIEW_KEYS))
         pose = found.attempt(lambda view=view: read_known_pose(view))  # type: ignore[misc]
         if pose is not None:
@@ -101,8 +106,9 @@ def check_views(
                 continue
             path = found.attempt(lambda view=view, kind=kind: view.file_path(kind, folder))  # type: ignore[misc]
             if path is not None and looked_at is not None:
-                _check_image(path, looked_at, carm, view.where(kind), read, found)
+                _check_image(path, (number, kind), looked_at, carm, view.where(kind), read, found)
     _check_different(read, found)
+    _check_together(read, patient, found)
     for (one, first), (other, second) in itertools.combinations(poses.items(), 2):
         if torch.allclose(first, second, atol=1e-6):
             found.warnings.append(f"{one} and {other} are given one and the same pose of the C-arm")
@@ -112,14 +118,16 @@ def check_views(
     return _by_key(read)
 
 
-def check_images(case: Case, found: Found) -> dict[str, Tensor]:
-    """All images of a case that could be read. Returns those (H, W) that could be read themselves, by key."""
+def check_images(case: Case, patient: Patient, found: Found) -> dict[str, Tensor]:
+    """All images of a case whose CT is of that patient. Returns those (H, W) that could be read themselves, by key."""
     read: dict[str, _Seen] = {}
     for number, view in enumerate(case.views):
         shown = View({}, view.intensity, frames=view.frames, display=case.display_of(number))
         for kind, path in view.images.items():
-            _check_image(path, shown, case.carm, f"{case.folder}/case.yaml, views[{number}].{kind}", read, found)
+            where = f"{case.folder}/case.yaml, views[{number}].{kind}"
+            _check_image(path, (number, kind), shown, case.carm, where, read, found)
     _check_different(read, found)
+    _check_together(read, patient, found)
     if case.views:
         _check_exchanged(read, next(iter(case.views[0].images)), found)
     return _by_key(read)
@@ -136,16 +144,27 @@ def _check_exchanged(read: Mapping[str, _Seen], first_kind: str, found: Found) -
         found.warnings += kinds_exchanged(shown, ANATOMY_IMAGES, DEVICE_IMAGES)
 
 
-def _check_image(path: Path, view: View, carm: CArm | None, where: str, read: dict[str, _Seen], found: Found) -> None:
-    """What is wrong with an image, as the registration would say; its values are put into `read`."""
+def _check_image(
+    path: Path,
+    place: tuple[int, str],
+    view: View,
+    carm: CArm | None,
+    where: str,
+    read: dict[str, _Seen],
+    found: Found,
+) -> None:
+    """What is wrong with an image, as the registration would say; its values are put into `read`.
+
+    `place` is its view, from 0, and its kind.
+    """
     stored = found.attempt(lambda: read_stored(path, view.frames))
     if stored is None:
         return
     found.warnings += [f"{path.name} {remark}" for remark in stored.remarks]
     settled = found.attempt(lambda: settled_intensity(view.intensity, stored, f"{where}: {path.name}"))
-    read[where] = _Seen(
-        stored.values, None if settled is None else rough_attenuation(stored.values_as(settled), settled)
-    )
+    exposure = None if stored.tags is None else Exposure(*place, path.name, stored.tags, view.frames)
+    attenuation = None if settled is None else rough_attenuation(stored.values_as(settled), settled)
+    read[where] = _Seen(stored.values, attenuation, exposure)
     if settled == "raw":
         found.attempt(lambda: check_intensity(stored.values, f"{where}: {path.name}"))
         if (dark := below_zero(stored.values, stored.padding)) is not None:
@@ -179,6 +198,11 @@ def _check_grid(grid: GridImage | None, camera: Camera, where: str) -> None:
         image = read_image(grid.path)
         check_matches(image, camera, f"{where}: it")
         find_distortion(image, camera, grid.pitch_mm, where)
+
+
+def _check_together(images: Mapping[str, _Seen], patient: Patient, found: Found) -> None:
+    exposures = [image.exposure for image in images.values() if image.exposure is not None]
+    found.warnings += [*other_patient(exposures, patient), *told_together(exposures)]
 
 
 def _check_different(images: Mapping[str, _Seen], found: Found) -> None:

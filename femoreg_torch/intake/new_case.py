@@ -12,8 +12,10 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, LabelTable, label_table, label_table_names
 from femoreg_torch.case.femoroplasty import (
+    ANATOMY_IMAGES,
     DEVICE,
     DEVICE_END,
+    DEVICE_IMAGES,
     DEVICE_POINTS,
     FEMUR,
     TEMPLATE,
@@ -26,7 +28,16 @@ from femoreg_torch.case.reading import CASE_NAME, VERSIONS
 from femoreg_torch.case.writing import display_content
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import new_folder, plain, write_text
-from femoreg_torch.fluoro import Display, Source, carm_settings, may_be_image, nearest_side, read_header
+from femoreg_torch.fluoro import (
+    Display,
+    Exposure,
+    Source,
+    carm_settings,
+    may_be_image,
+    nearest_side,
+    other_patient,
+    read_header,
+)
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.check import check_case
 from femoreg_torch.intake.label_tables import table_of_map
@@ -37,6 +48,7 @@ from femoreg_torch.volume import (
     Volume,
     bone_labels,
     is_in_ras,
+    patient_of,
     read_ct_told,
     read_labels_told,
     read_landmarks,
@@ -203,6 +215,7 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     if given.device is not None:
         content[DEVICE] = _device(folder, given, notes)
     images, device_images = _files(given.images, notes), _files(given.device_images, notes)
+    notes += _other_patient(given, images, device_images)
     content["carm"] = _carm(folder, given, images[0], notes)
     content |= _display(given, images, notes)
     content["views"] = _views(folder, images, device_images, given, notes)
@@ -345,6 +358,19 @@ def _files(paths: tuple[Path, ...], notes: list[str]) -> list[Path]:
 def _counted(path: Path) -> list[tuple[int, str]]:
     """A key by which `IM2` comes before `IM10`."""
     return [(int(word), "") if word.isdecimal() else (-1, word) for word in re.split(r"(\d+)", str(path))]
+
+
+def _other_patient(given: NewCase, images: list[Path], device_images: list[Path]) -> list[str]:
+    """In words, whether headers of images tell another patient than that of the CT, which the case does not keep."""
+    assert given.ct is not None
+    of_kinds = ((ANATOMY_IMAGES, images), (DEVICE_IMAGES, device_images))
+    exposures = [
+        Exposure(view, kind, _short(path), read_header(path))
+        for kind, paths in of_kinds
+        for view, path in enumerate(paths)
+        if is_dicom(path)
+    ]
+    return other_patient(exposures, patient_of(given.ct, given.series))
 
 
 def _views(

@@ -15,6 +15,7 @@ from femoreg_torch.volume.nifti import NIFTI_SUFFIXES
 from femoreg_torch.volume.text_headers import META_SUFFIXES, NRRD_SUFFIXES
 
 _COARSE_MM, _COARSE_STEP_MM = 1.5, 3.0  # the registration takes voxels of 1 mm
+_LEAST_LONG_MM, _MOST_LONG_MM = 80.0, 2500.0  # the longest edge: more than a femoral head with its neck; a whole body
 _SOFT_HU, _BONE_HU, _METAL_HU = -50.0, 300.0, 2800.0
 _LEAST_AIR = 0.005  # share of the voxels; beside every patient there is some
 _METAL_ML = 1.0
@@ -43,6 +44,12 @@ def ct_warnings(ct: Volume) -> list[str]:
     """In words, what may spoil a registration with this CT, HU."""
     told = []
     x, y, z = ct.spacing_mm
+    longest = max(n * mm for n, mm in zip(ct.data.shape[::-1], ct.spacing_mm, strict=True))
+    if not _LEAST_LONG_MM <= longest <= _MOST_LONG_MM:
+        told.append(
+            f"voxels of {x:.3g} × {y:.3g} × {z:.3g} mm make a CT that is {longest:.0f} mm long at most, which is no "
+            "hip's: is their size in mm?"
+        )
     _, within, between = sorted(ct.spacing_mm)  # slices may lie along any axis
     if within > _COARSE_MM or between > _COARSE_STEP_MM:
         told.append(f"coarse voxels ({x:.3g} × {y:.3g} × {z:.3g} mm): outlines of bones get blurred; 1 mm is meant")

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from femoreg_torch.case import RESULT_NAME, Result, read_result
+from femoreg_torch.case import RESULT_NAME, Case, Result, read_case, read_result
+from femoreg_torch.case.femoroplasty import femoral_head
 from femoreg_torch.case.model import Side
+from femoreg_torch.case.reading import CASE_NAME
 from femoreg_torch.delimited import read_csv
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.planning.diffusion import diffuse
@@ -22,6 +24,7 @@ from femoreg_torch.text import read_bytes
 
 Array = NDArray[np.float64]
 
+_SAME_HEAD_MM = 1.0  # a landmark of one CT that was placed once
 _MOST_BYTES = 2**16  # of a covariance as text
 _OTHER_SIDE = {"left": "right", "right": "left"}
 _NO_SIDE = ("", "nan", "none")  # as tables hold what is not told
@@ -143,6 +146,29 @@ def read_covariance(file: File) -> Array:
         return np.array(rows, float)
     except (TypeError, ValueError) as error:
         raise InputError(f"{file}: rows of numbers, all of one length, were expected.") from error
+
+
+def check_run(file: File, case: Case, side: Side) -> None:
+    """Raises `InputError` where a result.json is of another side or patient than the case of a plan for that side.
+
+    By the case that the result names, where that is still there: its side, and where its femoral head lies.
+    """
+    told = read_result(file.parent).case
+    folder = None if told is None else file.parent / told
+    if folder is None or not (folder / CASE_NAME).is_file():
+        return
+    of_run = read_case(folder)
+    if of_run.side not in (None, side):
+        raise InputError(
+            f"{file}: is a registration of the {of_run.side} side, and the plan is for the {side} one. Give a "
+            "registration of the plan's case."
+        )
+    there, here = (one.landmarks.get(femoral_head(side)) for one in (of_run, case))
+    if there is not None and here is not None and (apart := float((there - here).norm())) > _SAME_HEAD_MM:
+        raise InputError(
+            f"{file}: is a registration of {folder.resolve()}, whose femoral head lies {apart:.0f} mm from that of the "
+            "plan's case. Give a registration of the plan's case."
+        )
 
 
 def _covariance_of(result: Result, file: File) -> Array:

@@ -33,6 +33,15 @@ def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels) -> tuple[s
     return (*told, *doubts_about_the_frame(case, bones), *doubts_about_the_ends(case, bones))
 
 
+def notes_on_the_slices(case: Case, bones: BoneLabels) -> tuple[str, ...]:
+    """What the femoral heads of the label map, near their landmarks, say against the slice spacing, in words."""
+    from femoreg_torch.segment import doubted_slices, head_of  # as below
+
+    marks = {side: case.landmarks.get(f"FH-{side[0]}") for side in ("left", "right")}
+    heads = [head_of(bones, side, near) for side, near in marks.items() if near is not None]
+    return tuple(doubted_slices([head for head in heads if head is not None], bones.labels.spacing_mm))
+
+
 def doubts_about_the_ends(case: Case, bones: BoneLabels) -> tuple[str, ...]:
     """Entry points and targets a little outside the planned bone of the label map, or on its mirror, in words.
 

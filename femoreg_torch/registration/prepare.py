@@ -15,6 +15,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import (
     Circle,
     Distortion,
+    Exposure,
     Polygon,
     Shutter,
     StoredImage,
@@ -27,21 +28,24 @@ from femoreg_torch.fluoro import (
     find_distortion,
     find_shutter,
     intensity_of,
+    other_patient,
     raised,
     read_image,
     read_stored,
     saturated,
     settled_intensity,
     shades,
+    told_together,
     without_defects,
     without_penumbra,
 )
 from femoreg_torch.registration.models import ModelVolumes, model_attenuation, told_of_middle
-from femoreg_torch.registration.plan_and_landmarks import doubts_about_the_files
+from femoreg_torch.registration.plan_and_landmarks import doubts_about_the_files, notes_on_the_slices
 from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.registration.silhouette import outline_of
 from femoreg_torch.volume import (
+    NOBODY,
     BoneLabels,
     Volume,
     bone_labels,
@@ -52,9 +56,11 @@ from femoreg_torch.volume import (
     landmarks_without_bones,
     merged_bones,
     mostly_stray,
+    patient_of,
     read_ct_told,
     read_labels_told,
     resample_isotropic,
+    soft_bones,
     structure_attenuation,
     swapped_sides,
 )
@@ -86,6 +92,7 @@ def prepare_scene(case: Case) -> Scene:
             ct, bones = read_bones(case)
             outlining = beside.submit(outline_of, bones, case.anatomy)
             framing = beside.submit(doubts_about_the_files, case, ct, bones)
+            rounding = beside.submit(notes_on_the_slices, case, bones)
             check_inside(case.landmarks, ct)
             told_of_ct = (*bones.notes, *_check_anatomy(case, ct, bones))
             _check_path(case, ct)
@@ -93,7 +100,7 @@ def prepare_scene(case: Case) -> Scene:
             tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
         images, fields, bright, told = reading.result()
         if from_ct:
-            told = (*told_of_ct, *told)
+            told = (*told_of_ct, *rounding.result(), *told)
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
             outline, contradictions = outlining.result(), framing.result()
         made = {name: model.result() for name, model in making.items()}
@@ -141,7 +148,8 @@ def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]
     seen = densities(ct, bones.labels)
     if wrong := [*told, *filter(None, [seen.unscaled])]:
         raise InputError(f"{case.folder}: {'; '.join(wrong)}.")
-    return (*filter(None, [seen.light, seen.elsewhere]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
+    elsewhere = seen.light or seen.elsewhere or soft_bones(ct, bones.labels, bones.ids)
+    return (*filter(None, [elsewhere]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
 
 
 def _check_path(case: Case, ct: Volume) -> None:
@@ -273,7 +281,16 @@ def read_images(case: Case) -> tuple[ByKind, ByKind, tuple[str, ...]]:
     fields = {kind: tuple(None if one is None else one.field for one in read) for kind, read in found.items()}
     _check_different(case, images)
     remarks = [remark for read in found.values() for one in read if one is not None for remark in one.told]
-    return images, fields, (*remarks, *told)
+    exposures = [one.exposure for read in found.values() for one in read if one is not None and one.exposure]
+    return images, fields, (*remarks, *told, *_told_by_headers(exposures, case.ct_path))
+
+
+def _told_by_headers(exposures: Sequence[Exposure], ct: Path | None) -> list[str]:
+    """Where headers of the images contradict one another, or that of the CT, in words."""
+    told = told_together(exposures)
+    if ct is None or all(one.tags.patient == NOBODY for one in exposures):
+        return told
+    return [*other_patient(exposures, patient_of(ct)), *told]
 
 
 def _read_with_saturated(case: Case) -> tuple[ByKind, ByKind, ByKind, tuple[str, ...]]:
@@ -344,6 +361,7 @@ class _Image:
     field: Tensor | None  # (H, W) bool: what is exposed; None: all
     told: tuple[str, ...]  # of a shutter that was found, and of the file, in words
     shutter: Shutter | None  # that was found
+    exposure: Exposure | None  # what the header of a DICOM file says
 
 
 def _read_image(case: Case, index: int, kind: Kind, shutters: Sequence[Shutter] = ()) -> _Image:
@@ -379,7 +397,9 @@ def _read_image(case: Case, index: int, kind: Kind, shutters: Sequence[Shutter] 
         *([words] if words else []),
     )
     attenuation = image if logarithms else attenuation_image(image, field)
-    return _Image(attenuation, field, tuple(told + remark for remark in remarks), shutter)
+    name, tags = view.images[kind].name, stored.tags
+    exposure = None if tags is None else Exposure(index, kind, name, tags, view.frames)
+    return _Image(attenuation, field, tuple(told + remark for remark in remarks), shutter, exposure)
 
 
 def view_distortion(case: Case, index: int) -> Distortion | None:

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from femoreg_torch.anatomy import HIP, Anatomy
 from femoreg_torch.errors import InputError
-from femoreg_torch.segment.heads import Head, doubted_radius, fitted_heads
+from femoreg_torch.segment.heads import Head, doubted_radius, doubted_slices, fitted_heads
 from femoreg_torch.segment.network import BoneNetwork, bone_shares
 from femoreg_torch.segment.refine import closed_joint_mm2, refined_labels, unrefined_labels
 from femoreg_torch.segment.without_network import bones_without_network
@@ -128,6 +128,7 @@ def _looked_at(
     jointed = [f"{bone}_{side}" for side in hips for bone in ("hip", "femur") if side in femora]
     heads = fitted_heads(labels, {name: 1 + anatomy.bone_names.index(name) for name in jointed})
     warnings += [told for side, head in heads.items() for told in doubted_radius(side, head.radius_mm)]
+    warnings += doubted_slices(heads.values(), labels.spacing_mm)
     return Segmentation(labels, confidence, volume_ml, tuple(warnings), heads)
 
 

@@ -7,6 +7,8 @@ Points = NDArray[np.float64]
 
 _INLIER_MM = 1.0
 _REFITS = 30
+_NEAR_MM = 4.0  # of a sphere: points of a head that is a tenth longer than wide lie so near
+_LEAST_POINTS, _LEAST_RATIO = 50, 0.5
 
 
 def fitted_sphere(points: Points) -> Points:
@@ -23,3 +25,31 @@ def refitted_sphere(points: Points, first: NDArray[np.bool_]) -> Points:
         off = np.abs(np.linalg.norm(points - sphere[:3], axis=1) - sphere[3])
         sphere = fitted_sphere(points[off < _INLIER_MM])
     return sphere
+
+
+def stretch_along(points: Points, sphere: Points, axis: Points) -> float:
+    """How many times as long as across a spheroid about the `axis` (3,), a unit vector, is that fits the points (N, 3).
+
+    Least squares of |across|² = b·q − (t / stretch)² + c, where q is a point seen from the centre of the `sphere` (4,),
+    t its part along the axis and `across` the rest: first for points within 4 mm of the sphere, then again for those
+    within 1 mm of the spheroid. nan where they fit none.
+    """
+    q = points - sphere[:3]
+    along = q @ axis
+    kept, stretch = np.abs(np.linalg.norm(q, axis=1) - sphere[3]) < _NEAR_MM, np.nan
+    for _ in range(_REFITS):
+        if kept.sum() < _LEAST_POINTS:
+            return np.nan
+        equations = np.c_[q, along**2, np.ones(len(q))]
+        across = (q**2).sum(1) - along**2
+        solution = np.linalg.lstsq(equations[kept], across[kept], rcond=None)[0]
+        b, square, c = solution[:3], solution[3], solution[4]
+        if -square < _LEAST_RATIO**2:
+            return np.nan
+        stretch = (-square) ** -0.5
+        up = (b @ axis) * stretch**2 / 2
+        aside = (b - (b @ axis) * axis) / 2
+        wide = np.sqrt(max(c + aside @ aside + (up / stretch) ** 2, 0.0))
+        out = q - aside - np.outer(along * (1 - 1 / stretch) + up / stretch, axis)
+        kept = np.abs(np.linalg.norm(out, axis=1) - wide) < _INLIER_MM
+    return float(stretch)

@@ -2,14 +2,16 @@
 
 from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
 from femoreg_torch.volume.bones import BoneLabels, bone_labels
-from femoreg_torch.volume.contradictions import densities, misplaced_labels, shifted_labels
+from femoreg_torch.volume.contradictions import densities, misplaced_labels, shifted_labels, soft_bones
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
+from femoreg_torch.volume.dicom import patient_of
 from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
 from femoreg_torch.volume.guide_end import GuideEnd, guide_end
 from femoreg_torch.volume.labels import label_box_centre, looked_up
 from femoreg_torch.volume.landmarks import check_inside, read_landmarks, read_path_points, write_landmarks
 from femoreg_torch.volume.mesh import check_closed, voxelise_mesh
 from femoreg_torch.volume.mesh_files import bounds_of, is_in_ras, read_bodies, read_mesh
+from femoreg_torch.volume.patient import NOBODY, Patient
 from femoreg_torch.volume.reading import (
     read_ct,
     read_ct_told,
@@ -33,8 +35,10 @@ from femoreg_torch.volume.sides import (
 from femoreg_torch.volume.solids import Solid, solid_volumes
 
 __all__ = [
+    "NOBODY",
     "BoneLabels",
     "GuideEnd",
+    "Patient",
     "Solid",
     "Volume",
     "axis_aligned",
@@ -59,6 +63,7 @@ __all__ = [
     "merged_bones",
     "misplaced_labels",
     "mostly_stray",
+    "patient_of",
     "read_bodies",
     "read_ct",
     "read_ct_told",
@@ -75,6 +80,7 @@ __all__ = [
     "segment_names",
     "sharpened",
     "shifted_labels",
+    "soft_bones",
     "solid_volumes",
     "stray_landmarks",
     "structure_attenuation",

@@ -1,7 +1,7 @@
 """Do the grey values of a CT and a label map belong to one another?"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ _LEAST_BONE_HU, _LEAST_CORTEX_HU, _MOST_SOFT_HU = -150.0, 350.0, 350.0
 # to 379; with marrow of fat 0.39 to 0.83, by −3 on; of sacrum or femora alone 0.24 to 0.34, by −56 on. Of the same CTs
 # turned by 180° or flipped head to foot or front to back 0.03 to 0.19 were, by −772 to 29.
 _LEAST_DENSER, _LEAST_RISE_HU = 0.2, 40.0
+_LEAST_VOXELS = 50  # of a bone, and beside it
 _MOST_VALUES = 20_000  # a quantile needs no more
 _REACH_MM = 18.0  # how far a label map is looked for: a best place beyond the farthest shift that is told is none
 _BRIGHT_HU = 150.0, 550.0  # from here on a voxel is bone, from there on it is no more so
@@ -81,6 +82,34 @@ def densities(ct: Volume, labels: Volume) -> Densities:
     bone, beside = data[inside], data[far & ~near]
     denser = float((bone > _quantile(beside, 0.95)).float().mean())
     return Densities(_quantile(bone, 0.5), _quantile(bone, 0.95), _quantile(beside, 0.5), denser)
+
+
+def soft_bones(ct: Volume, labels: Volume, ids: Mapping[str, int]) -> str | None:
+    """In words, which bones of a label map on the grid of a CT, HU, are no denser than what lies beside them, or None.
+
+    As of the whole map, in which the others would hide one: its id may be that of a muscle, say.
+    """
+    told = []
+    for name, number in ids.items():
+        low, high = label_box(labels, [number])
+        margin = [math.ceil(4 * max(_SHIFTS_MM, s) / s) for s in labels.spacing_mm]
+        shape = labels.data.shape[::-1]
+        box = tuple(slice(max(a - m, 0), min(b + m, n)) for a, b, m, n in zip(low, high, margin, shape, strict=True))
+        data, near = (volume.data[box[::-1]][_steps(ct, _SHIFTS_MM)] for volume in (ct, labels))
+        inside = near == number
+        beside = data[_grown(inside, 3) & ~_grown(inside, 1) & (near == 0)]
+        if inside.sum() < _LEAST_VOXELS or len(beside) < _LEAST_VOXELS:
+            continue
+        bone, soft = _quantile(data[inside], 0.5), _quantile(beside, 0.5)
+        denser = float((data[inside] > _quantile(beside, 0.95)).float().mean())
+        if denser < _LEAST_DENSER and bone - soft < _LEAST_RISE_HU:
+            told.append(f"{name} ({bone:.0f} and {soft:.0f} HU)")
+    if not told:
+        return None
+    return (
+        f"label map: {', '.join(told)}: as dense as what lies beside, in the median, so these labels hold soft tissue. "
+        "Check their ids in `ct.bones`, and look whether they lie on their bones"
+    )
 
 
 def misplaced_labels(ct: Volume, labels: Volume, ids: Sequence[int]) -> str | None:

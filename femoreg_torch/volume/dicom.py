@@ -18,12 +18,21 @@ from numpy.typing import NDArray
 
 from femoreg_torch.arrays import opened
 from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.volume.patient import NOBODY, Patient, compared_text, patient_in
 
 _TAGS = (
     "SOPInstanceUID", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "ImageType", "Rows",
     "Columns", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "NumberOfFrames", "AcquisitionNumber",
-    "RescaleSlope", "RescaleIntercept", "PhotometricInterpretation", "BitsStored", "HighBit",
+    "RescaleSlope", "RescaleIntercept", "PhotometricInterpretation", "BitsStored", "HighBit", "PatientID",
+    "PatientName", "StudyInstanceUID", "FrameOfReferenceUID", "SliceThickness", "SpacingBetweenSlices",
 )  # fmt: skip
+# What all files of a series have in common (DICOM PS3.3, A.1.2), and what they are of by it.
+_IN_COMMON = {
+    "PatientID": "patients",
+    "PatientName": "patients",
+    "StudyInstanceUID": "studies",
+    "FrameOfReferenceUID": "frames of reference",
+}
 _VOLUMES = ("CT", "MR", "PT", "NM", "OT")  # modalities whose series may be volumes; others are images, reports, masks
 _DEFLATED = "1.2.840.10008.1.2.1.99"  # transfer syntax
 _KINDS_OF_PIXELS = (b"OB", b"OW", b"OF", b"OD", b"UN")  # value representations of their element
@@ -33,6 +42,8 @@ _NOT_DICOM = {".gz", ".nii", ".nrrd", ".mha", ".mhd", ".json", ".txt", ".png", "
 _MOST_LISTED = 12  # series in a message
 _SAME_PLACE_MM = 0.01  # slices that are closer are one
 _SHEAR_MM = 0.3  # of the last slice against the first: what rounding of positions and axes may make of it
+_ROUNDED_MM, _SAME_STEP = 0.03, 0.02  # of the step that a header tells: 0.625 mm may be written as 0.6
+_MOST_STEP = 1.25  # in thicknesses of a slice: those of a reconstruction without gaps touch or overlap
 
 
 @dataclass(frozen=True)
@@ -63,6 +74,10 @@ class Slice:
         except (TypeError, ValueError):
             return None
         return value if np.isfinite(value) else None
+
+    def words(self, name: str) -> str:
+        """The text of a tag as it is compared; empty where it is missing."""
+        return compared_text(self.header, name)
 
     def whole(self, name: str, otherwise: int) -> int:
         """The whole number of a tag."""
@@ -211,10 +226,19 @@ def choose_series(path: Path, wanted: str | None = None) -> Series:
         raise InputError(f"{folder}: {how}; there are: {listed}. Give one's number, its UID or a part of its name.")
     if not chosen:
         raise InputError(f"{folder}: none of its DICOM series is a volume; there are: {listed}. Choose another folder.")
+    patients = {one.slices[0].words("PatientID") for one in chosen} - {""}
+    several = f" of {len(patients)} patients (PatientID)" if len(patients) > 1 else ""
     raise InputError(
-        f"{folder}: holds {len(chosen)} DICOM series, one was expected: {listed}. Choose one: by its number, its UID "
-        "or a part of its name with `--series`, or by the path of one of its files in case.yaml."
+        f"{folder}: holds {len(chosen)} DICOM series{several}, one was expected: {listed}. Choose one: by its number, "
+        "its UID or a part of its name with `--series`, or by the path of one of its files in case.yaml."
     )
+
+
+def patient_of(path: Path, wanted: str | None = None) -> Patient:
+    """Whom the DICOM series that `choose_series` takes is of; of a file of another format nothing is known."""
+    if not (path.is_dir() or is_dicom(path)):
+        return NOBODY
+    return patient_in(choose_series(path, wanted).slices[0].header)
 
 
 def _listed(series: Sequence[Series]) -> str:
@@ -230,8 +254,8 @@ def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:
     """A series as a volume, and what was done to it in words.
 
     Slices are sorted along their normal. Those of a tilted gantry are brought onto a rectangular grid, by linear
-    interpolation. Raises `InputError` for slices that are missing, doubled, unevenly spaced or of different kinds, and
-    for pixels that cannot be decoded.
+    interpolation. Raises `InputError` for slices that are missing, doubled, unevenly spaced or of different kinds,
+    patients, studies or frames of reference, and for pixels that cannot be decoded.
     """
     where = str(series.slices[0].path.parent)
     for one in series.slices:
@@ -246,7 +270,9 @@ def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:
             f"{where}: {series.told} has {len(several)} files of several frames each ({several[0].path.name}, …). "
             "Export it with all frames in one file, or with a file for each slice."
         )
+    _check_in_common(series, where)
     layout = _sorted_slices(series, where)
+    told = _other_steps(series, layout, where)
     image = _decoded(layout.slices)
     image.SetOrigin(layout.origin.tolist())
     spacing = (*layout.spacing.tolist(), layout.step @ layout.axes[:, 2])
@@ -254,10 +280,10 @@ def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:
     image.SetDirection(layout.axes.ravel().tolist())
     lean = layout.step - (layout.step @ layout.axes[:, 2]) * layout.axes[:, 2]
     if np.linalg.norm(lean) * (len(layout.slices) - 1) <= _SHEAR_MM:  # which adds up from slice to slice
-        return image, ()
+        return image, told
     angle = np.degrees(np.arcsin(np.linalg.norm(lean) / np.linalg.norm(layout.step)))
     note = f"the gantry was tilted by {angle:.1f}°: the slices of {where} were brought onto a rectangular grid"
-    return _straightened(image, lean), (note,)
+    return _straightened(image, lean), (*told, note)
 
 
 def _decoded(slices: Sequence[Slice]) -> sitk.Image:
@@ -336,6 +362,44 @@ def _sorted_slices(series: Series, where: str) -> _Layout:
         )
     axes = np.stack([row, column, normal / np.linalg.norm(normal)], 1)
     return _Layout(slices, axes, pixel[::-1], places[0], step)
+
+
+def _check_in_common(series: Series, where: str) -> None:
+    """Raises `InputError` for files of several patients, studies or frames of reference in one series.
+
+    Missing tags say nothing, and neither do tags with another value in nearly each file, as some anonymisers leave
+    them. Values are not told: messages end up in logs.
+    """
+    for tag, kinds in _IN_COMMON.items():
+        files: dict[str, list[str]] = {}
+        for one in series.slices:
+            if value := one.words(tag):
+                files.setdefault(value, []).append(one.path.name)
+        if len(files) > 1 and 2 * len(files) <= len(series.slices):
+            listed = "; ".join(f"{len(names)} as {names[0]}" for names in list(files.values())[:_MOST_LISTED])
+            raise InputError(
+                f"{where}: {series.told} holds files of {len(files)} {kinds}, by {tag}: {listed}. Move those of each "
+                "into a folder of its own, or export the series anew."
+            )
+
+
+def _other_steps(series: Series, layout: "_Layout", where: str) -> tuple[str, ...]:
+    """What tags of the slices say against the step between their positions, which is taken, in words."""
+    first, along = series.slices[0], float(np.linalg.norm(layout.step))
+    across = float(layout.step @ layout.axes[:, 2])  # less than along the table where the gantry was tilted
+    said, thickness = first.number("SpacingBetweenSlices"), first.number("SliceThickness")
+    told = []
+    if said and min(abs(abs(said) - mm) for mm in (along, across)) > max(_ROUNDED_MM, _SAME_STEP * across):
+        told.append(
+            f"SpacingBetweenSlices of {where} is {abs(said):.4g} mm, but the positions of its slices are {across:.4g} "
+            "mm apart, which is taken: if bones look stretched, export the CT anew"
+        )
+    if thickness and thickness > 0 and across > _MOST_STEP * thickness + _ROUNDED_MM:
+        told.append(
+            f"the slices of {where} are {thickness:.4g} mm thick and {across:.4g} mm apart, so there are gaps: does "
+            "the folder hold each of them, or every second or third?"
+        )
+    return tuple(told)
 
 
 def _check_alike(series: Series, cosines: NDArray[np.float64], pixel: NDArray[np.float64], where: str) -> None:

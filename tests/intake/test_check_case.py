@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,16 @@ import torch
 import trimesh
 from intake_files import HEAD, case_content, landmarks, markups, ras_affine, write_content, write_files
 
-from femoreg_torch.anatomy import HIP, load_anatomy
+from femoreg_torch.anatomy import HIP, label_table, load_anatomy
 from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 from femoreg_torch.intake import check_case
-from femoreg_torch.intake.check_anatomy import SeenAnatomy, check_landmarks
+from femoreg_torch.intake.check_anatomy import SeenAnatomy, check_heads, check_landmarks
 from femoreg_torch.intake.found import Found
 from femoreg_torch.intake.volumes import ct_warnings
 from femoreg_torch.registration import prepare_scene
-from femoreg_torch.volume import Volume, axis_aligned, read_ct, read_label_map
+from femoreg_torch.volume import BoneLabels, Volume, axis_aligned, read_ct, read_label_map
 from femoreg_torch.volume.bones import nearest_voxel
 
 PLANES_PX = 315  # of three planes of that CT: 60 voxels of 4 mm high, 420 pixels for 80 of them
@@ -602,6 +603,76 @@ def test_bones_as_light_as_foam_are_a_warning(files: Path, tmp_path: Path) -> No
     assert checked.problems == ()
     assert any(told in warning for warning in checked.warnings)
     assert any(told in note for note in prepare_scene(read_case(folder)).missing)
+
+
+def test_a_bone_of_soft_tissue_is_told_by_check_and_registration(files: Path, tmp_path: Path) -> None:
+    """Its id is that of a muscle: the label of the sacrum is given to what lies in front of it."""
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    write_content(folder, case_content())
+    image = nibabel.load(folder / "labels.nii.gz")
+    values = np.asarray(image.dataobj)
+    number = label_table("femoreg")["sacrum"][0]
+    muscle = np.where(values == number, 0, values)
+    muscle[np.roll(values == number, 20, 1) & (muscle == 0)] = number
+    nibabel.save(nibabel.Nifti1Image(muscle, ras_affine()), folder / "labels.nii.gz")
+    for notes in (check_case(folder, find_start=False).warnings, prepare_scene(read_case(folder)).missing):
+        assert sum(note.startswith("label map: sacrum (40 and") for note in notes) == 1
+
+
+@pytest.mark.parametrize(
+    ("scale", "told"),
+    [
+        ((1.0, 1.0, 1.0), []),
+        ((1.6, 1.6, 1.6), ["the left femoral head has a radius", "the right femoral head has a radius"]),
+        ((1.0, 1.0, 1.3), ["both femoral heads of the label map measure"]),
+    ],
+)
+def test_heads_that_are_too_large_or_too_long_are_told(files: Path, scale: tuple[float, ...], told: list[str]) -> None:
+    """As where the voxels are not as large as the header says."""
+    table = label_table("femoreg")
+    labels = read_label_map(files / "labels.nii.gz")
+    scaled = torch.diag(torch.tensor([*scale, 1.0], dtype=torch.float64)) @ labels.lps_from_index
+    found = Found()
+    bones = BoneLabels(Volume(labels.data, scaled), {name: ids[0] for name, ids in table.items()})
+    check_heads(SeenAnatomy(bones=bones, anatomy=HIP), found)
+    assert [warning[: len(start)] for warning, start in zip(found.warnings, told, strict=True)] == told
+
+
+@pytest.mark.parametrize(
+    ("scale", "told"),
+    [(0.1, ["that is 32 mm long at most", "left femoral head has a radius of 2.1 mm"]), (0.02, ["that is 6 mm long"])],
+)
+def test_a_hip_of_no_size_is_told_by_its_size(files: Path, tmp_path: Path, scale: float, told: list[str]) -> None:
+    """As in cm, or less: too small for the surface of a bone, which had ended in a traceback."""
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    for name in ("ct.nii.gz", "labels.nii.gz"):
+        image = nibabel.load(folder / name)
+        smaller = np.diag([scale, scale, scale, 1]) @ ras_affine()
+        nibabel.save(nibabel.Nifti1Image(np.asarray(image.dataobj), smaller), folder / name)
+    marks = {name: tuple(scale * v for v in point) for name, point in landmarks().items()}
+    (folder / "landmarks.mrk.json").write_text(markups(marks), encoding="utf-8")
+    content = case_content()
+    content["plan"]["entry_point"] = [scale * v for v in content["plan"]["entry_point"]]
+    write_content(folder, content)
+    warnings = check_case(folder, find_start=False).warnings
+    assert all(any(words in warning for warning in warnings) for words in told)
+    with suppress(InputError):  # the smaller one, of which nothing is left on voxels of 1 mm
+        prepare_scene(read_case(folder))
+
+
+def test_vertebrae_that_a_ct_does_not_show_are_no_warning(files: Path, tmp_path: Path) -> None:
+    """A hip bone that nobody labelled is one."""
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    write_content(folder, case_content())
+    relabelled({}, folder, label_table("femoreg")["hip_right"][0], 0)
+    found = check_case(folder, find_start=False)
+    assert "not in labels.nii.gz: vertebrae" in found.facts
+    absent = [warning for warning in found.warnings if "no voxel of" in warning]
+    assert len(absent) == 1
+    assert "the hip_right: nothing is lost if the CT shows none" in absent[0]
 
 
 def warned(folder: Path, content: Content) -> str:

@@ -1,6 +1,7 @@
 """A case made of the files that users have: what it then holds, and that it appears whole or not at all."""
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from femoreg_torch.anatomy import fitting_tables, label_table
 from femoreg_torch.case import read_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.fluoro import Display, read_image
-from femoreg_torch.intake import inspect_path
+from femoreg_torch.intake import check_case, inspect_path
+from femoreg_torch.registration import prepare_scene
 from femoreg_torch.volume import read_ct, read_labels, read_landmarks
 
 
@@ -577,3 +579,27 @@ def test_where_the_source_stands_is_told_where_nobody_says_it(
     assert told in " ".join(capsys.readouterr().out.split())
     assert main(arguments(files, tmp_path / "other", ignore_header=True, source="anterior")) == 0
     assert told not in " ".join(capsys.readouterr().out.split())
+
+
+def test_images_of_another_patient_and_another_pose_are_told_by_all_that_read_them(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By `new-case`, which still has the header of the CT, by `check`, and in the result."""
+    images = []
+    for n, angle in enumerate((0, 20)):
+        images.append(tmp_path / f"run{n}")
+        tags = {"PatientID": "q", "PositionerPrimaryAngle": angle, "PositionerSecondaryAngle": 0}
+        write_dicom_image(images[-1], n, **tags)
+    given = {"images": images[:1], "device_images": images[1:], "source": "anterior", "ignore_header": True}
+    assert main(arguments(files, tmp_path / "case", **given)) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "run1: of another patient than the CT, by PatientID" in told
+    assert "view 1: view1_device.dcm was taken 20° from view1.dcm" in told
+    folder = tmp_path / "case"
+    content = yaml.safe_load((folder / "case.yaml").read_text(encoding="utf-8"))
+    shutil.copytree(files / "dicom", folder / "dicom")
+    content["ct"]["image"] = "dicom"
+    (folder / "case.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    for notes in (check_case(folder, find_start=False).warnings, prepare_scene(read_case(folder)).missing):
+        assert any("view1.dcm, view1_device.dcm: of another patient than the CT" in note for note in notes)
+        assert any("view1_device.dcm was taken 20° from view1.dcm" in note for note in notes)

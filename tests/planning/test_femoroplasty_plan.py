@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path as File
 from typing import Any
 
@@ -16,7 +17,7 @@ import trimesh
 from pyarrow import parquet, table
 from scipy import ndimage
 
-from femoreg_torch.case import Case, ObjectQuality, Result, read_case, write_case
+from femoreg_torch.case import Case, ObjectQuality, Result, read_case, result_content, write_case
 from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation.report.parts import Material, Section
@@ -25,7 +26,7 @@ from femoreg_torch.files import write_json
 from femoreg_torch.geometry import Poses
 from femoreg_torch.planning.distribution import mechanism
 from femoreg_torch.planning.model import with_cement
-from femoreg_torch.planning.offsets import carried_out, directions, turned_ends
+from femoreg_torch.planning.offsets import carried_out, check_run, directions, turned_ends
 from femoreg_torch.planning.path import (
     Ellipsoid,
     Path,
@@ -445,6 +446,35 @@ def test_the_path_of_a_plan_is_read_by_a_case(written: File, folder: File, plan:
         (other / "landmarks.json").symlink_to(folder / "again" / "landmarks.json")
         with pytest.raises(InputError, match=told):
             read_case(other)
+
+
+def test_a_registration_of_another_case_than_the_plans_is_refused(
+    written: File, folder: File, tmp_path: File, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of the other side, or of another patient; one of the case itself, or whose case is gone, passes."""
+    good = ObjectQuality((), 0.0, (0.0, 0.0), (0.1,) * 3, (0.1,) * 3, None, True, "all views agree")
+    pose = torch.eye(4, dtype=torch.float64)
+    covariance = torch.eye(6, dtype=torch.float64)
+    result = Result(Poses(pose[None], {"femur": pose}), {"femur": good}, path_covariance=covariance)
+    case = read_case(folder)
+    other = tmp_path / "other"
+    shutil.copytree(folder, other, symlinks=True)
+    run = tmp_path / "run"
+    run.mkdir()
+    for place, side, told in (
+        (folder, "left", None),
+        (tmp_path / "gone", "right", None),
+        (folder, "right", "of the left side, and the plan is for the right one"),
+        (other, "left", "whose femoral head lies 9 mm from that of the plan's case"),
+    ):
+        marks = {name: point + (9 if place == other else 0) * torch.eye(3)[0] for name, point in case.landmarks.items()}
+        write_landmarks(other / "landmarks.json", marks)
+        write_json(run / "result.json", result_content(dataclasses.replace(result, case=str(place))))
+        with nullcontext() if told is None else pytest.raises(InputError, match=told):
+            check_run(run / "result.json", case, side)
+    words = ["--covariance", str(run / "result.json"), "--case", str(folder)]
+    assert main(["plan-robustness", str(written), *words]) == 2
+    assert "Give a registration of the plan's case" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_report_tells_the_plan(written: File, folder: File, plan: FemoroplastyPlan) -> None:

@@ -1,5 +1,6 @@
 """Landmarks that do not lie where the label map has the femoral heads: the plan stands in their frame."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from femoreg_torch.registration.plan_and_landmarks import (
     doubts_about_the_ends,
     doubts_about_the_files,
     doubts_about_the_frame,
+    notes_on_the_slices,
 )
 from femoreg_torch.volume import BoneLabels, Volume, axis_aligned
 
@@ -106,3 +108,24 @@ def test_a_ct_of_another_origin() -> None:
     assert "both femoral heads of the label map lie" in told
     far = bones(torch.tensor([0, 0, 300.0]).double())  # other checks tell that the landmarks lie outside of the CT
     assert doubts_about_the_frame(right, far) == ()
+
+
+@pytest.mark.parametrize(("factor", "says"), [(1.0, None), (0.9, "less"), (1.1, "more")])
+@pytest.mark.parametrize("sides", [("left", "right"), ("left",)])
+def test_slices_that_are_told_too_far_apart_make_heads_longer_than_wide(
+    factor: float, says: str | None, sides: tuple[str, ...]
+) -> None:
+    """As the CT, so its labels and the landmarks in it: nothing contradicts another thing."""
+    stretch = torch.diag(torch.tensor([1.0, 1.0, factor, 1.0], dtype=torch.float64))
+    there = bones()
+    stretched = replace(there, labels=Volume(there.labels.data, stretch @ there.labels.lps_from_index))
+    right = case(*(HEADS[side] * stretch.diagonal()[:3] for side in HEADS))
+    right = replace(right, landmarks={f"FH-{side[0]}": right.landmarks[f"FH-{side[0]}"] for side in sides})
+    told = notes_on_the_slices(right, stretched)
+    assert len(told) == (says is not None)
+    if says is not None:
+        which = "both femoral heads" if len(sides) == 2 else "the femoral head"
+        percent, direction = re.findall(rf"{which} of the label map measures? (\d+) % (\w+) across", told[0])[0]
+        assert direction == says
+        assert float(percent) == pytest.approx(10, abs=1.5)
+        assert f"are the slices of the CT {2 * factor:.3g} mm apart" in told[0]

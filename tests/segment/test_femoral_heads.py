@@ -11,7 +11,8 @@ from hip_scenes import HEAD, RADIUS_MM, answering, hip_scene, shares_of
 
 from femoreg_torch.commands.main import main
 from femoreg_torch.intake.planes import planes_through_joints
-from femoreg_torch.segment.heads import fitted_heads
+from femoreg_torch.segment.heads import Head, doubted_slices, fitted_heads
+from femoreg_torch.segment.sphere import stretch_along
 from femoreg_torch.volume import Volume, axis_aligned, write_volume
 
 SPACING = 1.5
@@ -56,6 +57,45 @@ def test_a_head_without_its_socket_is_not_looked_for() -> None:
     assert fitted_heads(labels, {"femur_left": 5}) == {}
     (head,) = fitted_heads(labels, {"femur_left": 5, "hip_left": 1}).values()
     np.testing.assert_allclose(head.centre, HEAD, atol=0.5)
+
+
+@pytest.mark.parametrize("stretch", [0.85, 1.0, 1.12])
+def test_a_spheroid_is_found_from_its_upper_half_with_a_neck_on_it(stretch: float) -> None:
+    generator = np.random.default_rng(1)
+    axis = np.array([0.36, -0.48, 0.8])
+    ball = generator.normal(size=(4000, 3))
+    ball *= 23 / np.linalg.norm(ball, axis=1, keepdims=True)
+    ball = ball[ball @ [1, 2, 2] > -10]
+    neck = generator.uniform(0, 20, (500, 3)) - [0, 40, 40]
+    points = ball + np.outer(ball @ axis, axis) * (stretch - 1)
+    found = stretch_along(np.concatenate([points, neck]) + HEAD, np.r_[HEAD + 0.5, 23.0], axis)
+    assert found == pytest.approx(stretch, abs=1e-6)
+
+
+def test_what_fits_no_spheroid_says_nothing() -> None:
+    far = np.random.default_rng(1).normal(size=(100, 3)) + 500
+    assert math.isnan(stretch_along(far, np.r_[HEAD, 23.0], np.array([0, 0, 1.0])))
+    nothing = Head(torch.zeros(3), 23.0, 1.0, math.nan)
+    assert doubted_slices([nothing], (1.0, 1.0, 1.0)) == doubted_slices([], (1.0, 1.0, 1.0)) == []
+
+
+@pytest.mark.parametrize(
+    ("stretches", "thick_mm", "told"),
+    [
+        ((1.03, 1.03), 1.0, 0),
+        ((1.05, 1.05), 1.0, 1),
+        ((1.10, 1.00), 1.0, 0),  # one is deformed
+        ((1.05,), 1.0, 0),
+        ((1.07,), 1.0, 1),
+        ((1.07, 1.07), 3.0, 0),  # labels may be a slice too long
+        ((1.10, 1.10), 3.0, 1),
+    ],
+)
+def test_what_anatomy_and_thick_slices_explain_is_not_told(
+    stretches: tuple[float, ...], thick_mm: float, told: int
+) -> None:
+    heads = [Head(torch.zeros(3), 23.0, 0.5, stretch) for stretch in stretches]
+    assert len(doubted_slices(heads, (1.0, 1.0, thick_mm))) == told
 
 
 def test_the_planes_go_through_the_heads_and_show_each_joint_large() -> None:

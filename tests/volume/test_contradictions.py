@@ -4,9 +4,10 @@ import pytest
 import torch
 from scipy import ndimage
 
-from femoreg_torch.volume import Volume, axis_aligned, densities, misplaced_labels, shifted_labels
+from femoreg_torch.volume import Volume, axis_aligned, densities, misplaced_labels, shifted_labels, soft_bones
 
 IDS = (1, 2)
+NAMES = {"hip_left": 1, "femur_left": 2}
 
 
 def ct_and_labels(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> tuple[Volume, Volume]:
@@ -27,7 +28,8 @@ def ct_and_labels(spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> tupl
 
 def unasked(ct: Volume, labels: Volume) -> bool:
     found = densities(ct, labels)
-    return found.unscaled is None and found.light is None and found.elsewhere is None
+    told = (found.unscaled, found.light, found.elsewhere, soft_bones(ct, labels, NAMES))
+    return all(one is None for one in told)
 
 
 @pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 3.0), (3.0, 3.0, 3.0)])
@@ -114,3 +116,30 @@ def test_labels_beside_their_bones_are_told(shift: tuple[int, int, int], spacing
     found = [float(part) for part in told.partition("moved by (")[2].partition(")")[0].split(", ")]
     asked = [-n * s for n, s in zip(voxels, spacing, strict=True)]
     assert found == pytest.approx(asked, abs=max(2.0, spacing[2] / 2) + 0.5)
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.7, 0.7, 3.0), (3.0, 3.0, 3.0)])
+@pytest.mark.parametrize("number", [1, 2])
+def test_one_bone_of_soft_tissue_is_told_though_the_other_is_right(
+    number: int, spacing: tuple[float, float, float]
+) -> None:
+    """As where its id is that of a muscle."""
+    ct, labels = ct_and_labels(spacing)
+    other = labels.data * (labels.data != number)
+    away = -round(48 / spacing[2]) if number == 1 else round(48 / spacing[2])
+    muscle = torch.where(other > 0, other, ((labels.data == number) * number).roll(away, 0))
+    wrong = labels.with_data(muscle.to(labels.data.dtype))
+    assert densities(ct, wrong).elsewhere is None
+    told = soft_bones(ct, wrong, NAMES)
+    (name,) = (name for name, n in NAMES.items() if n == number)
+    assert told is not None
+    assert told.startswith(f"label map: {name} (")
+    assert "these labels hold soft tissue" in told
+    assert soft_bones(ct, wrong, {n: i for n, i in NAMES.items() if i != number}) is None
+
+
+def test_a_few_voxels_of_a_bone_say_nothing() -> None:
+    ct, labels = ct_and_labels()
+    few = torch.zeros_like(labels.data)
+    few[60, 20, 70:74] = 2
+    assert soft_bones(ct, labels.with_data(few), {"femur_left": 2}) is None

@@ -1,5 +1,6 @@
 """CTs and segmentations in DICOM, as pydicom and highdicom write them, against the points that their headers tell."""
 
+import re
 from pathlib import Path
 
 import highdicom
@@ -463,3 +464,73 @@ def test_headers_that_lead_its_reader_astray(tmp_path: Path, tags: dict, message
     write_series(tmp_path / "ct", **tags)
     with pytest.raises(InputError, match=message):
         read_ct(tmp_path / "ct")
+
+
+@pytest.mark.parametrize(
+    ("tag", "other", "kinds"),
+    [
+        ("PatientID", "q", "patients"),
+        ("PatientName", "Other^Hip", "patients"),
+        ("StudyInstanceUID", "1.2.3", "studies"),
+        ("FrameOfReferenceUID", "1.2.3", "frames of reference"),
+    ],
+)
+@pytest.mark.parametrize("place", ["above", "between", "same"])
+def test_a_series_of_two_patients_or_studies_is_refused(
+    tmp_path: Path, tag: str, other: str, kinds: str, place: str
+) -> None:
+    """Whose slices lie above those of the first, or between them, where positions contradict nothing, or on them."""
+    folder = tmp_path / "ct"
+    uid = write_series(folder)[0].SeriesInstanceUID
+    up = {"above": SIZE[0] * STEP_MM, "between": STEP_MM / 2, "same": 0.0}[place]
+    for n, data in enumerate(write_series(tmp_path / "second", **{tag: other})):
+        x, y, z = (float(v) for v in data.ImagePositionPatient)
+        data.SeriesInstanceUID, data.ImagePositionPatient = uid, [x, y, z + up]
+        data.save_as(folder / f"second_{n}")
+    with pytest.raises(InputError, match=rf"14 files\) holds files of 2 {kinds}, by {tag}: 7 as IM0244; 7 as second_0"):
+        read_ct(folder)
+
+
+def test_names_that_anonymisers_give_each_file_are_no_mixture(tmp_path: Path) -> None:
+    folder = tmp_path / "ct"
+    for n, data in enumerate(write_series(folder)):
+        data.PatientID, data.PatientName, data.FrameOfReferenceUID = (
+            f"{n}",
+            "" if n else "Simulated^Hip",
+            generate_uid(),
+        )
+        data.save_as(folder / f"IM{250 - n:04d}")
+    np.testing.assert_allclose(sampled(read_ct(folder), points_of(AXIAL, NO_LEAN)), VALUES - 1024)
+
+
+def test_two_series_of_two_patients_are_told_as_that(tmp_path: Path) -> None:
+    write_series(tmp_path / "ct")
+    write_series(tmp_path / "ct", number=5, PatientID="q")
+    with pytest.raises(InputError, match=r"holds 2 DICOM series of 2 patients \(PatientID\)"):
+        read_ct(tmp_path / "ct")
+
+
+@pytest.mark.parametrize(
+    ("tags", "told"),
+    [
+        ({"SpacingBetweenSlices": 2.8}, "SpacingBetweenSlices .* is 2.8 mm, but the positions .* 2.5 mm apart"),
+        ({"SpacingBetweenSlices": -2.5}, None),
+        ({"SliceThickness": 1.25}, "are 1.25 mm thick and 2.5 mm apart"),  # as if every second file were there
+        ({"SliceThickness": 5.0}, None),  # slices that overlap
+    ],
+)
+def test_steps_that_other_tags_contradict_are_told(tmp_path: Path, tags: dict, told: str | None) -> None:
+    write_series(tmp_path / "ct", **tags)
+    volume, found = read_ct_told(tmp_path / "ct")
+    assert volume.spacing_mm[2] == pytest.approx(STEP_MM)
+    assert len(found) == (told is not None)
+    assert told is None or re.search(told, found[0])
+
+
+def test_a_tilted_gantry_may_tell_steps_along_the_table(tmp_path: Path) -> None:
+    tilt = np.radians(15)
+    axes = Rotation.from_euler("x", tilt).as_matrix()
+    lean = STEP_MM * (np.array([0, 0, 1 / np.cos(tilt)]) - axes[:, 2])
+    for said in (STEP_MM, STEP_MM / np.cos(tilt)):
+        write_series(tmp_path / f"ct{said:.3f}", axes, lean=lean, SpacingBetweenSlices=f"{said:.4f}")
+        assert [note[:14] for note in read_ct_told(tmp_path / f"ct{said:.3f}")[1]] == ["the gantry was"]
