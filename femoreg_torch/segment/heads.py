@@ -23,7 +23,7 @@ _NEAR_MM = 40.0  # of a landmark in the head, to each side: a head has 32 mm, an
 ADULT_RADIUS_MM = (17.0, 32.0)
 # By which a head may be longer or shorter along the voxels' third axis than across. Of 6 surfaces, 20 label maps of a
 # network and 3 drawn by hand, and 34 of simulated CTs, both heads together were within 2.6 % and each within 3.1 %, but
-# for one of 6 % on slices of 3 mm; the 20 on slices of 2 to 5 mm, within 4.1 % together. All were stretched and
+# for one of 6 % on slices of 3 mm; 14 of the 20 on slices of 2 to 5 mm, within 4.1 % together. All were stretched and
 # compressed by 10 %: both together were told of 125 of 126, one head alone of 238 of 252. Beside that labels may reach
 # half a slice too far, or too short, on either end.
 _MOST_OF_BOTH, _MOST_OF_ONE = 0.035, 0.06

@@ -250,12 +250,13 @@ def _cameras(imagined: Imagined) -> Information:
 
 
 def registered_row(folder: Path, plan: Plan, truth: Poses, model: XrayModel, seed: int) -> Row:
-    """Errors of the last stage of `plan`, from the truth, where images show what it draws and the noise of photons.
+    """Errors of the last stage of `plan` that moves all, from the truth, where images show what it draws and photon noise.
 
     The case in `folder` tells everything but the images: these are what the stage itself draws at the truth, with as
     many photons as there would be in the open beam of the X-rays.
     """
-    stage = next(step for step in reversed(plan.steps) if isinstance(step, Stage))
+    stages = (step for step in reversed(plan.steps) if isinstance(step, Stage))
+    stage = next(stage for stage in stages if any(PELVIS in body.move for body in stage.bodies))
     case = read_case(folder)
     scene = prepare_scene(case)
     carm = replace(scene.carm, camera=stage.level.camera(scene.carm.camera))
