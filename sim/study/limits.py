@@ -250,7 +250,7 @@ def _cameras(imagined: Imagined) -> Information:
 
 
 def registered_row(folder: Path, plan: Plan, truth: Poses, model: XrayModel, seed: int) -> Row:
-    """Errors of the last stage of `plan` that moves all, from the truth, where images show what it draws and photon noise.
+    """Errors of the last stage of `plan` that moves all, from the truth; images show what it draws, and photon noise.
 
     The case in `folder` tells everything but the images: these are what the stage itself draws at the truth, with as
     many photons as there would be in the open beam of the X-rays.
