@@ -5,22 +5,37 @@ registration, and the planned path, which stands in their frame, ends beside the
 round, so that the label map by itself says where their middles are.
 """
 
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
 import torch
 
 from femoreg_torch.case import Case
 from femoreg_torch.volume import BoneLabels, Volume, shifted_labels
 from femoreg_torch.volume.bones import nearest_voxel
 
+if TYPE_CHECKING:  # with trimesh, whose import the reading of CT and images hides
+    from femoreg_torch.segment import Head
+
 # Seen of 60 cases of three simulators, whose landmarks were told by a surface, by rules or by their makers: at most
 # 2.7 mm, and both heads alike by at most 1.0 mm.
 MOST_OFF_HEAD_MM = 5.0
 MOST_OFF_BONE_MM, _FAR_OFF_BONE_MM = 5.0, 12.0  # of an entry point or target, from the middle of the nearest voxel
-_NOT_ASKED_MM = 1.0  # of the head that the path ends in, or of the left one: the second takes a tenth of a second
+_NOT_ASKED_MM = 1.0  # of the head that the path ends in, or of the left one: then both cannot be off alike
 # Of both in one direction, besides half a voxel, and how far that may differ between them.
 _MOST_ALIKE_MM, _ALIKE_MM = 2.0, 2.0
 
 
-def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]:
+def heads_near_landmarks(case: Case, bones: BoneLabels) -> dict[str, "Head"]:
+    """The femoral heads of the label map, spheres or not, by the names of the landmarks that they are looked for by."""
+    from femoreg_torch.segment import head_of  # see above
+
+    names = {"left": "FH-l", "right": "FH-r"}
+    found = {name: head_of(bones, side, case.landmarks[name]) for side, name in names.items() if name in case.landmarks}
+    return {name: head for name, head in found.items() if head is not None}
+
+
+def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels, heads: Mapping[str, "Head"]) -> tuple[str, ...]:
     """All that CT, landmarks and plan say against the label map, which lies on the CT's grid, in words."""
     shift = shifted_labels(ct, bones.labels)
     told = []
@@ -30,16 +45,14 @@ def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels) -> tuple[s
             f"the label map would lie on the bones of the CT if it were moved by ({by}) mm LPS: check that it belongs "
             "to this CT, and the origin of both"
         )
-    return (*told, *doubts_about_the_frame(case, bones), *doubts_about_the_ends(case, bones))
+    return (*told, *doubts_about_the_frame(case, bones, heads), *doubts_about_the_ends(case, bones))
 
 
-def notes_on_the_slices(case: Case, bones: BoneLabels) -> tuple[str, ...]:
-    """What the femoral heads of the label map, near their landmarks, say against the slice spacing, in words."""
-    from femoreg_torch.segment import doubted_slices, head_of  # as below
+def notes_on_the_slices(bones: BoneLabels, heads: Mapping[str, "Head"]) -> tuple[str, ...]:
+    """What the femoral heads of the label map say against the slice spacing, in words."""
+    from femoreg_torch.segment import doubted_slices  # see above
 
-    marks = {side: case.landmarks.get(f"FH-{side[0]}") for side in ("left", "right")}
-    heads = [head_of(bones, side, near) for side, near in marks.items() if near is not None]
-    return tuple(doubted_slices([head for head in heads if head is not None], bones.labels.spacing_mm))
+    return tuple(doubted_slices(heads.values(), bones.labels.spacing_mm))
 
 
 def doubts_about_the_ends(case: Case, bones: BoneLabels) -> tuple[str, ...]:
@@ -72,17 +85,13 @@ def doubts_about_the_ends(case: Case, bones: BoneLabels) -> tuple[str, ...]:
     return tuple(told)
 
 
-def doubts_about_the_frame(case: Case, bones: BoneLabels) -> tuple[str, ...]:
+def doubts_about_the_frame(case: Case, bones: BoneLabels, heads: Mapping[str, "Head"]) -> tuple[str, ...]:
     """Landmarks of femoral heads that lie beside those of the label map, in words; none where these are no spheres."""
-    from femoreg_torch.segment import head_centre  # with trimesh, whose import the reading of CT and images hides
-
     target = None if case.plan is None else case.plan.target
-    there = {f"FH-{side[0]}": side for side in ("left", "right") if f"FH-{side[0]}" in case.landmarks}
     off = {}
-    for name in sorted(there, key=lambda name: target is None or not torch.equal(case.landmarks[name], target)):
-        centre = head_centre(bones, there[name], case.landmarks[name])
-        if centre is not None:
-            off[name] = centre - case.landmarks[name]
+    for name in sorted(heads, key=lambda name: target is None or not torch.equal(case.landmarks[name], target)):
+        if heads[name].may_be_one and heads[name].is_round:
+            off[name] = heads[name].centre - case.landmarks[name]
             if len(off) == 1 and float(off[name].norm()) < _NOT_ASKED_MM:
                 return ()  # so both cannot be off alike, and no path ends in the other one
     if len(off) == 2:

@@ -40,7 +40,11 @@ from femoreg_torch.fluoro import (
     without_penumbra,
 )
 from femoreg_torch.registration.models import ModelVolumes, model_attenuation, told_of_middle
-from femoreg_torch.registration.plan_and_landmarks import doubts_about_the_files, notes_on_the_slices
+from femoreg_torch.registration.plan_and_landmarks import (
+    doubts_about_the_files,
+    heads_near_landmarks,
+    notes_on_the_slices,
+)
 from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene
 from femoreg_torch.registration.silhouette import outline_of
@@ -91,8 +95,7 @@ def prepare_scene(case: Case) -> Scene:
         if from_ct:
             ct, bones = read_bones(case)
             outlining = beside.submit(outline_of, bones, case.anatomy)
-            framing = beside.submit(doubts_about_the_files, case, ct, bones)
-            rounding = beside.submit(notes_on_the_slices, case, bones)
+            looking = beside.submit(_told_of_files, case, ct, bones)
             check_inside(case.landmarks, ct)
             told_of_ct = (*bones.notes, *_check_anatomy(case, ct, bones))
             _check_path(case, ct)
@@ -100,9 +103,10 @@ def prepare_scene(case: Case) -> Scene:
             tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
         images, fields, bright, told = reading.result()
         if from_ct:
-            told = (*told_of_ct, *rounding.result(), *told)
+            contradictions, told_of_slices = looking.result()
+            told = (*told_of_ct, *told_of_slices, *told)
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
-            outline, contradictions = outlining.result(), framing.result()
+            outline = outlining.result()
         made = {name: model.result() for name, model in making.items()}
     for name, (volumes, axis) in made.items():
         thing = case.objects[name]
@@ -150,6 +154,12 @@ def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]
         raise InputError(f"{case.folder}: {'; '.join(wrong)}.")
     elsewhere = seen.light or seen.elsewhere or soft_bones(ct, bones.labels, bones.ids)
     return (*filter(None, [elsewhere]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
+
+
+def _told_of_files(case: Case, ct: Volume, bones: BoneLabels) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What speaks against CT, label map, landmarks and plan, and what is noted of the slices, in words."""
+    heads = heads_near_landmarks(case, bones)
+    return doubts_about_the_files(case, ct, bones, heads), notes_on_the_slices(bones, heads)
 
 
 def _check_path(case: Case, ct: Volume) -> None:

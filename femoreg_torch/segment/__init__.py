@@ -1,7 +1,7 @@
 """Bones and landmarks from a CT alone."""
 
 from femoreg_torch.segment.bones import Segmentation, segment_bones, segment_bones_without_network
-from femoreg_torch.segment.heads import Head, doubted_radius, doubted_slices, head_centre, head_of
+from femoreg_torch.segment.heads import Head, doubted_radius, doubted_slices, head_of
 from femoreg_torch.segment.network import BoneNetwork, load_bone_network
 from femoreg_torch.segment.points import Proposal, propose_landmarks
 
@@ -12,7 +12,6 @@ __all__ = [
     "Segmentation",
     "doubted_radius",
     "doubted_slices",
-    "head_centre",
     "head_of",
     "load_bone_network",
     "propose_landmarks",

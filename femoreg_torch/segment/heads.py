@@ -76,12 +76,6 @@ def head_of(bones: BoneLabels, side: str, near: Tensor | None = None) -> Head | 
     return fitted_heads(labels, wanted).get(side)
 
 
-def head_centre(bones: BoneLabels, side: str, near: Tensor | None = None) -> Tensor | None:
-    """Centre (3,), LPS mm, of the sphere that fits the head as by `head_of`; None where it is no sphere."""
-    head = head_of(bones, side, near)
-    return head.centre if head and head.may_be_one and head.is_round else None
-
-
 def doubted_slices(heads: Iterable[Head], spacing_mm: Sequence[float]) -> list[str]:
     """A warning where heads, which are round, are longer or shorter along the slices' normal than anatomy explains.
 

@@ -16,6 +16,7 @@ from femoreg_torch.registration.plan_and_landmarks import (
     doubts_about_the_ends,
     doubts_about_the_files,
     doubts_about_the_frame,
+    heads_near_landmarks,
     notes_on_the_slices,
 )
 from femoreg_torch.volume import BoneLabels, Volume, axis_aligned
@@ -46,6 +47,14 @@ def case(left: Tensor, right: Tensor) -> Case:
     plan = planned("left", left + torch.tensor([40.0, 0, -60]).double(), left, None)
     femur = CaseObject("femur", bones=("femur_left",))
     return Case(Path("case"), load_carm("cios_fusion"), {"femur": femur}, (), landmarks=landmarks, plan=plan)
+
+
+def told_of_frame(of: Case, there: BoneLabels) -> tuple[str, ...]:
+    return doubts_about_the_frame(of, there, heads_near_landmarks(of, there))
+
+
+def told_of_files(of: Case, ct: Volume, there: BoneLabels) -> tuple[str, ...]:
+    return doubts_about_the_files(of, ct, there, heads_near_landmarks(of, there))
 
 
 @pytest.mark.parametrize(("beside_mm", "told"), [(0, 0), (3, 0), (8, 1), (30, 0)])  # the last is told elsewhere
@@ -79,7 +88,7 @@ def test_a_plan_in_the_other_femur() -> None:
 )
 def test_heads_beside_their_landmarks(left: tuple[float, ...], right: tuple[float, ...], says: str | None) -> None:
     off = [torch.tensor(one, dtype=torch.float64) for one in (left, right)]
-    told = doubts_about_the_frame(case(HEADS["left"] + off[0], HEADS["right"] + off[1]), bones())
+    told = told_of_frame(case(HEADS["left"] + off[0], HEADS["right"] + off[1]), bones())
     assert len(told) == (says is not None)
     assert all(each.startswith(says or "") for each in told)
 
@@ -87,8 +96,8 @@ def test_heads_beside_their_landmarks(left: tuple[float, ...], right: tuple[floa
 def test_a_label_map_beside_the_bones_of_the_ct() -> None:
     right, there = case(HEADS["left"], HEADS["right"]), bones()
     ct = there.labels.with_data(torch.where(there.labels.data > 0, 400.0, 30.0))
-    assert doubts_about_the_files(right, ct, there) == ()
-    (told,) = doubts_about_the_files(right, ct.with_data(ct.data.roll(2, 1)), there)  # 4 mm
+    assert told_of_files(right, ct, there) == ()
+    (told,) = told_of_files(right, ct.with_data(ct.data.roll(2, 1)), there)  # 4 mm
     assert "if it were moved by (0, 4, 0) mm LPS" in told
 
 
@@ -98,16 +107,16 @@ def test_a_label_map_of_shells_holds_no_middle_of_a_head() -> None:
     away = (points * 2 + hollow.labels.lps_from_index[:3, 3] - HEADS["left"]).norm(dim=-1)
     hollow.labels.data[away < 18] = 0
     assert doubts_about_the_ends(right, hollow) == ()
-    assert doubts_about_the_frame(right, hollow) == ()
+    assert told_of_frame(right, hollow) == ()
 
 
 def test_a_ct_of_another_origin() -> None:
     right = case(HEADS["left"], HEADS["right"])
-    assert doubts_about_the_frame(right, bones(torch.tensor([1.0, 0, 0]).double())) == ()
-    (told,) = doubts_about_the_frame(right, bones(torch.tensor([0, 10.0, 0]).double()))
+    assert told_of_frame(right, bones(torch.tensor([1.0, 0, 0]).double())) == ()
+    (told,) = told_of_frame(right, bones(torch.tensor([0, 10.0, 0]).double()))
     assert "both femoral heads of the label map lie" in told
     far = bones(torch.tensor([0, 0, 300.0]).double())  # other checks tell that the landmarks lie outside of the CT
-    assert doubts_about_the_frame(right, far) == ()
+    assert told_of_frame(right, far) == ()
 
 
 @pytest.mark.parametrize(("factor", "says"), [(1.0, None), (0.9, "less"), (1.1, "more")])
@@ -121,7 +130,7 @@ def test_slices_that_are_told_too_far_apart_make_heads_longer_than_wide(
     stretched = replace(there, labels=Volume(there.labels.data, stretch @ there.labels.lps_from_index))
     right = case(*(HEADS[side] * stretch.diagonal()[:3] for side in HEADS))
     right = replace(right, landmarks={f"FH-{side[0]}": right.landmarks[f"FH-{side[0]}"] for side in sides})
-    told = notes_on_the_slices(right, stretched)
+    told = notes_on_the_slices(stretched, heads_near_landmarks(right, stretched))
     assert len(told) == (says is not None)
     if says is not None:
         which = "both femoral heads" if len(sides) == 2 else "the femoral head"
