@@ -29,6 +29,7 @@ import femoreg_torch
 from femoreg_torch.commands.status import BAD_INPUT, DONE, INTERRUPTED
 from femoreg_torch.errors import InputError, defect_in_one_line, shortened
 from femoreg_torch.extras import missing_extra
+from femoreg_torch.memory import keep_freed_memory
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
@@ -120,6 +121,7 @@ def console_script() -> NoReturn:
     once. Before that, threads have ended, and all that was registered for the end has run.
     """
     prepare_process()
+    keep_freed_memory()
     gc.set_threshold(*_COLLECTED_AFTER)
     ended: list[int] = []
     atexit.register(_end, ended)  # what is registered first runs last
