@@ -7,15 +7,13 @@ patient from one place, so that no shadow is deeper than that share of the light
 share of what is drawn without the device is added.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import Camera, Poses
-from femoreg_torch.registration.imaging import draw
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.scene import Kind, Scene
 from femoreg_torch.similarity import FixedSimilarity, Similarity, against_field
@@ -32,28 +30,26 @@ class Veil:
 
 def veil_over(
     scene: Scene,
-    poses: Poses,
     render: Sequence[str],
     image: tuple[Kind, int],
-    camera: Camera,
     level: Level,
     share: float,
     scatter: float,
+    alone: Callable[[str], Tensor],
 ) -> Veil | None:
-    """The veil of a `share` over an image (kind, view) at a level, whose grid is that of `camera`.
+    """The veil of a `share` over an image (kind, view) at a level.
 
-    It is drawn once, with the objects of `render` at `poses`, and `scatter` per primary light. None where the share is
-    nothing, or the image is of the first kind, which shows the patient alone, or there is none of that kind.
+    It is drawn once, with the objects of `render`, of which `alone` tells the line integrals (H, W) one by one, and
+    `scatter` per primary light. None where the share is nothing, or the image is of the first kind, which shows the
+    patient alone, or there is none of that kind.
     """
     kind, view = image
     patient = scene.first_kind, view
     if share <= 0 or kind == scene.first_kind or not scene.there([scene.first_kind], [view]):
         return None
-    names = scene.shown(render, scene.first_kind)
-    bones = torch.zeros(camera.shape, device=scene.device)
-    if names:
-        where = torch.stack([poses.camera_from(name)[view] for name in names])[None]
-        bones = draw([scene.objects[name] for name in names], where, camera, level.step_mm)[0]
+    bones = torch.zeros(level.camera(scene.carm.camera).shape, device=scene.device)
+    for name in scene.shown(render, scene.first_kind):
+        bones = bones + alone(name)
     shadow, beside = (level.image(scene.image(*one), scene.carm.camera) for one in (image, patient))
     fields = [exposed_field(scene, one, level) for one in (image, patient)]
     exposed = [field for field in fields if field is not None]

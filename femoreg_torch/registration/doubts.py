@@ -117,7 +117,8 @@ def doubts(
     if strange := doubts_about_the_images(scene, poses, imaging):
         plan = *doubts_about_the_plan(case, scene), *doubts_about_the_guide(case, poses)
         return (*told.contradictions, *doubts_about_units(case, told, True), *strange, *plan)
-    others: list[Callable[[], tuple[str, ...]]] = [
+    clear = scene.where_unsaturated()
+    questions: list[Callable[[], tuple[str, ...]]] = [
         lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
         lambda: doubts_about_motion(covariance),
@@ -125,16 +126,14 @@ def doubts(
         lambda: doubts_about_the_guide(case, poses),
         lambda: doubts_about_the_models(told, scene, poses),
         lambda: doubts_about_told_tips(case, told),
+        lambda: doubts_about_smears(clear, poses),  # what moved or was smeared seems to be of another size as well
+        lambda: doubts_about_size(case, told, clear, poses, imaging),
+        lambda: doubts_about_handedness(told, scene, poses, imaging),
+        lambda: doubts_about_rigidity(clear, poses, imaging),
     ]
-    clear = scene.where_unsaturated()
-    others.append(lambda: doubts_about_smears(clear, poses))
-    first = on_all_cores(lambda ask: ask(), others, scene.device)
-    found = (
-        *chain(*first),  # what moved or was smeared seems to be of another size as well
-        *doubts_about_size(case, told, clear, poses, imaging),
-        *doubts_about_handedness(told, scene, poses, imaging),
-        *doubts_about_rigidity(clear, poses, imaging),
-    )
+    # The longest are asked first, so that no core waits long for another at the end.
+    answers = on_all_cores(lambda ask: ask(), questions[::-1], scene.device)[::-1]
+    found = tuple(chain(*answers))
     found = (*doubts_about_units(case, told, bool(found)), *found)
     return (*told.contradictions, *found, *doubts_beside_devices(clear, poses, imaging, bool(found)))
 

@@ -1,5 +1,6 @@
 """The objective of a stage: mean similarity cost of a batch of candidate deltas (paper, equations 1, 3, 4)."""
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,6 +19,7 @@ from femoreg_torch.registration.imaging import (
     below_white,
     below_white_slope,
     draw,
+    draw_still,
     draw_with_jacobian,
     filled,
     filled_slope,
@@ -89,18 +91,22 @@ def _target(
     if len(rigid) < len(bodies):
         moves = set(drawn)
     still = [name for name in drawn if name not in moves]
+
+    @functools.cache
+    def alone(name: str) -> Tensor:
+        return draw_still(scene.objects[name], poses.camera_from(name)[view], camera, level.step_mm)
+
     background = torch.zeros(camera.shape, device=scene.device)
-    if still:
-        where = torch.stack([poses.camera_from(name)[view] for name in still])[None]
-        background = draw([scene.objects[name] for name in still], where, camera, level.step_mm)[0]
+    for name in still:
+        background = background + alone(name)
     placing = [name for body in rigid for name in body.objects]
     looked_at = pixel_weights(scene, poses, render, placing, image, camera, level.step_mm, weights)
     seen = imaging.as_seen(scene.scatter)
-    veil = veil_over(scene, poses, render, image, camera, level, imaging.scatter - seen.scatter, seen.scatter)
+    veil = veil_over(scene, render, image, level, imaging.scatter - seen.scatter, seen.scatter, alone)
     scatter = torch.tensor(seen.scatter, device=scene.device) if seen.scatter else None
     if veil is not None:
         scatter = seen.scatter + veil.light
-    sure = believed(scene, poses, render, image, camera, level.step_mm, scatter)
+    sure = believed(scene, poses, render, image, camera, level.step_mm, scatter, alone)
     if sure is not None:
         looked_at = sure if looked_at is None else looked_at * sure
     fixed = prepared(scene, image, level, similarity, looked_at, veil)

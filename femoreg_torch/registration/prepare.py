@@ -85,7 +85,7 @@ def prepare_scene(case: Case) -> Scene:
     objects: dict[str, RigidObject] = {}
     tissue = outline = None
     contradictions: tuple[str, ...] = ()
-    with ThreadPoolExecutor(max_workers=1) as beside:  # images and models are read while the CT is
+    with ThreadPoolExecutor(max_workers=2) as beside:  # images and models are read while the CT is
         reading = beside.submit(_read_with_saturated, case)
         making = {
             thing.name: beside.submit(_read_model, case, thing, thing.model)

@@ -1,7 +1,7 @@
 """Pixel weights of an image: which pixels a stage's similarity looks at, and how far it believes what is drawn."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, Poses, project_points
-from femoreg_torch.registration.imaging import draw, filled, filled_slope, hardened_slope
+from femoreg_torch.registration.imaging import filled, filled_slope, hardened_slope
 from femoreg_torch.registration.scene import Kind, Scene, Segmentation
 from femoreg_torch.similarity import derivative_taps, image_gradients
 
@@ -76,10 +76,12 @@ def believed(
     camera: Camera,
     step_mm: float,
     scatter: Tensor | None,
+    alone: Callable[[str], Tensor],
 ) -> Tensor | None:
     """Weights (H, W), 0 to 1, of an image (kind, view): lower where what is drawn may be wrong; None where all is sure.
 
-    Light per primary light, `scatter`, fills the shadows, see `imaging.filled`.
+    Light per primary light, `scatter`, fills the shadows, see `imaging.filled`. `alone` tells the line integrals (H, W)
+    of an object by itself.
 
     Where the materials of an object were estimated, a block at the border of two may be drawn as the wrong one. That
     draws edges which the image does not have, and a strong one outweighs the faint true ones of its patch. With g² the
@@ -91,15 +93,14 @@ def believed(
     unsure = [name for name in names if scene.objects[name].unsure]
     if not unsure:
         return None
-    where = {name: poses.camera_from(name)[view][None, None] for name in names}
-    alone = {name: draw([scene.objects[name]], pose, camera, step_mm)[0] for name, pose in where.items()}
-    drawn = torch.stack(list(alone.values())).sum(0)
+    drawn = torch.stack([alone(name) for name in names]).sum(0)
     slope = filled_slope(drawn, scatter)
     mistakes = torch.zeros_like(drawn)
     for name in unsure:
-        seen = slope * hardened_slope(alone[name], scene.objects[name].hardening)
+        seen = slope * hardened_slope(alone(name), scene.objects[name].hardening)
+        where = poses.camera_from(name)[view][None, None]
         for difference in scene.objects[name].unsure:
-            mistakes += _edges(seen * project([difference], where[name], camera, step_mm)[0])
+            mistakes += _edges(seen * project([difference], where, camera, step_mm)[0])
     edges, mistakes = (_over_patches(of) for of in (_edges(filled(drawn, scatter)), mistakes))
     return (edges + _FLAT) / (edges + _MISTAKES * mistakes + _FLAT)
 

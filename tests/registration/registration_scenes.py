@@ -1,6 +1,7 @@
 """A small operating room: three rigid objects, three views, images rendered more finely than they are registered."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -10,11 +11,11 @@ from torch.nn import functional as F
 
 from femoreg_torch.case import Start
 from femoreg_torch.drr import project
-from femoreg_torch.geometry import CArm, Poses, about_point, centred_camera, exp_se3, rigid, rotation_angle
+from femoreg_torch.geometry import Camera, CArm, Poses, about_point, centred_camera, exp_se3, rigid, rotation_angle
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration import OrbitSearch, Plan, Stage, Step
 from femoreg_torch.registration.calibration import Calibration
-from femoreg_torch.registration.imaging import PLAIN
+from femoreg_torch.registration.imaging import PLAIN, draw_still
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene, Segmentation
 from femoreg_torch.registration.turn_search import TurnSearch
 from femoreg_torch.volume import Volume, axis_aligned
@@ -193,3 +194,8 @@ def quicker(plan: Plan) -> Plan:
         return replace(step, optimiser=fewer, imaging=PLAIN)
 
     return replace(plan, steps=tuple(changed(step) for step in plan.steps))
+
+
+def alone(scene: Scene, view: int, camera: Camera) -> Callable[[str], Tensor]:
+    """What each object by itself shows to a camera of a view (from 0), at its true pose."""
+    return lambda name: draw_still(scene.objects[name], true_poses().camera_from(name)[view], camera, 1.0)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from registration_scenes import CARM, REFERENCE_POINTS, float64, make_scene, off, true_poses
+from registration_scenes import CARM, REFERENCE_POINTS, alone, float64, make_scene, off, true_poses
 from torch import Tensor
 
 from femoreg_torch.geometry import pose_difference
@@ -40,7 +40,7 @@ def test_drawn_light_is_what_the_image_without_the_device_adds(scene: Scene) -> 
     exact = {kind: tuple(shown(kind, view) + behind for view in range(3)) for kind in scene.images}
     drawn = replace(scene, images=exact)
     for view in range(3):
-        veil = veil_over(drawn, TRUTH, ALL, ("device", view), CAMERA, LEVEL, 0.3, 0.0)
+        veil = veil_over(drawn, ALL, ("device", view), LEVEL, 0.3, 0.0, alone(scene, view, CAMERA))
         assert veil is not None
         assert veil.exposed is None
         torch.testing.assert_close(filled(shown("device", view), veil.light) + behind, veil.image)
@@ -51,7 +51,7 @@ def test_drawn_light_is_what_the_image_without_the_device_adds(scene: Scene) -> 
 
 def test_only_images_with_a_device_beside_one_without_are_veiled(scene: Scene) -> None:
     def veil(kind: str, of: Scene, share: float = 0.3) -> object:
-        return veil_over(of, TRUTH, ALL, (kind, 1), CAMERA, LEVEL, share, 0.0)  # type: ignore[arg-type]
+        return veil_over(of, ALL, (kind, 1), LEVEL, share, 0.0, alone(of, 1, CAMERA))  # type: ignore[arg-type]
 
     assert veil("device", scene) is not None
     assert veil("device", scene, share=0.0) is None
@@ -63,7 +63,7 @@ def test_a_veil_is_exposed_where_both_images_are(scene: Scene) -> None:
     left[:, 60:] = False
     top[60:] = False
     shaded = replace(scene, fields={"anatomy": (None, left, None), "device": (None, top, None)})
-    veil = veil_over(shaded, TRUTH, ALL, ("device", 1), CAMERA, LEVEL, 0.3, 0.0)
+    veil = veil_over(shaded, ALL, ("device", 1), LEVEL, 0.3, 0.0, alone(shaded, 1, CAMERA))
     assert veil is not None
     assert veil.exposed is not None
     assert torch.equal(veil.exposed, left & top)

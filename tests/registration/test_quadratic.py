@@ -7,14 +7,17 @@ from typing import Any
 import pytest
 import scipy.stats
 import torch
-from registration_scenes import REFERENCE_POINTS, VOLUMES, float64, make_scene, off, segmentations, true_poses
+from registration_scenes import CARM, REFERENCE_POINTS, VOLUMES, float64, make_scene, off, segmentations, true_poses
 
+from femoreg_torch.geometry import centred_camera
 from femoreg_torch.registration import imaging as drawing
 from femoreg_torch.registration.imaging import (
     PLAIN,
     Imaging,
     below_white,
     below_white_slope,
+    draw,
+    draw_still,
     filled,
     filled_slope,
     hardened,
@@ -24,7 +27,7 @@ from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import Prior, image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, reference_point_in_view
 from femoreg_torch.registration.weights import Weighting
-from femoreg_torch.similarity import GradNcc, Ncc, Similarity
+from femoreg_torch.similarity import GradNcc, Ncc, Similarity, derivative_taps, image_gradients
 
 _LEVEL = Level(pixel_mm=3.0, step_mm=2.0)
 _SIMILARITY = GradNcc(patch_radius=5)
@@ -215,3 +218,16 @@ def test_what_two_images_of_a_view_show_alike_is_drawn_once(monkeypatch: pytest.
     drawn.clear()
     anatomy_first(deltas)
     assert drawn == ["project"] * 6  # two bones in two views, then the device in each
+
+
+def test_coarse_voxels_are_drawn_on_coarse_pixels_with_the_same_edges() -> None:
+    """Voxels of 3 mm on pixels of 0.5 mm, and of an odd number, as every other is; on pixels of 3 mm as before."""
+    scene, pose = make_scene(true_poses()), true_poses().camera_from("pelvis")[1]
+    bone, taps = scene.objects["pelvis"], derivative_taps(1.1, torch.device("cpu"))
+    fine = centred_camera(1020.0, (0.5, 0.5), (527, 525))
+    exact, found = draw([bone], pose[None, None], fine, 0.5)[0], draw_still(bone, pose, fine, 0.5)
+    assert found.shape == exact.shape
+    assert not torch.equal(found, exact)
+    edges, mistakes = (image_gradients(of[None], taps)[0].square().sum(0).mean() for of in (exact, found - exact))
+    assert mistakes < 2e-3 * edges
+    assert torch.equal(draw_still(bone, pose, CARM.camera, 0.5), draw([bone], pose[None, None], CARM.camera, 0.5)[0])

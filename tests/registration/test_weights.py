@@ -4,7 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from registration_scenes import CARM, REFERENCE_POINTS, float64, line_integrals, make_scene, segmentations, true_poses
+from registration_scenes import (
+    CARM,
+    REFERENCE_POINTS,
+    alone,
+    float64,
+    line_integrals,
+    make_scene,
+    segmentations,
+    true_poses,
+)
 from torch import Tensor
 
 from femoreg_torch.detect import Detection
@@ -159,10 +168,10 @@ def with_a_mistake(scene: Scene, unsure: bool) -> Scene:
 
 def test_what_may_be_drawn_wrong_counts_less_and_all_else_as_before(scene: Scene) -> None:
     """Little where a false block is drawn, and all where no patch reaches it."""
-    assert believed(scene, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, None) is None
+    assert believed(scene, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, None, alone(scene, 1, CARM.camera)) is None
     unsure = with_a_mistake(scene, unsure=True)
-    assert believed(unsure, TRUTH, ALL, ("anatomy", 1), CARM.camera, 1.0, None) is None
-    weights = believed(unsure, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, None)
+    assert believed(unsure, TRUTH, ALL, ("anatomy", 1), CARM.camera, 1.0, None, alone(unsure, 1, CARM.camera)) is None
+    weights = believed(unsure, TRUTH, ALL, ("device", 1), CARM.camera, 1.0, None, alone(unsure, 1, CARM.camera))
     assert weights is not None
     assert weights.min() >= 0
     assert weights.max() <= 1
