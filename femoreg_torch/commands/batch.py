@@ -67,6 +67,9 @@ def batch(
         require_trust: End with status 3 if a result is not trusted.
         device: Where to compute, as for `femoreg register`; all jobs share one GPU.
     """
+    import os
+
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the processes to come, as `femoreg register` has it
     from rich.console import Console
 
     from femoreg_torch.commands.status import BAD_INPUT, DONE, NOT_TRUSTED
