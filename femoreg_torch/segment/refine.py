@@ -4,8 +4,8 @@ The network says which bone lies where, to about a coarse voxel; in that band th
 it is brighter than a threshold between soft tissue and the brightest bone near it, as edges of a blurred plate lie at a
 part of its height (Prevrhal et al., Phys. Med. Biol. 44, 1999, of cortex in CT). A low threshold first, so that cortex
 has no gaps and encloses its marrow, which is kept by the network's share and by closing. Then the crest of the cortex
-says what lies beyond it and what within (`crest`), also where the network is wrong by a few millimetres; and last the
-edge itself.
+says what lies beyond it and what within (`crest`), also where the network is wrong by a few millimetres; then the
+edge itself. Joints are opened, and last femoral heads filled to the sphere of their cortex (`whole_heads`).
 """
 
 from dataclasses import dataclass
@@ -21,6 +21,7 @@ from torch.nn import functional as F
 from femoreg_torch.anatomy import Anatomy
 from femoreg_torch.segment.boxes import Mask, radius
 from femoreg_torch.segment.crest import sides_of_the_crest
+from femoreg_torch.segment.whole_heads import whole_heads
 from femoreg_torch.volume import Volume
 
 _FINEST_MM = 1.0  # finer voxels are averaged; labels then lie within half a millimetre
@@ -92,6 +93,7 @@ def refined_labels(ct: Volume, shares: Tensor, grid: Volume, anatomy: Anatomy) -
     without_channels = _trimmed(found, ~channels, _CHANNEL_MM, region.spacing)
     found = np.minimum(_trimmed(found, ~dark, _BEYOND_MM, region.spacing), without_channels)
     found = opened_joints(found, region.hu.numpy(), region.spacing, anatomy)
+    found = whole_heads(found, region.hu.numpy(), region.spacing, anatomy)
     return _onto(labels, torch.from_numpy(found), region)
 
 

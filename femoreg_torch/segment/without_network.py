@@ -17,20 +17,20 @@ from torch import from_numpy
 from femoreg_torch.anatomy import Anatomy
 from femoreg_torch.errors import InputError
 from femoreg_torch.segment.sheets import APART, BONE, OUTSIDE, UNDECIDED, Links, Mask, Values, bone_of, minimum_cut
+from femoreg_torch.segment.sphere_votes import (
+    COARSE_MM,
+    RADII_MM,
+    RIDGE_RANGE_HU,
+    Points,
+    along_rays,
+    directions,
+    sphere_votes,
+)
 from femoreg_torch.volume import Volume, resample_isotropic
-
-Points = NDArray[np.float64]
 
 VOXEL_MM = 1.25
 _DARKEST_HU, _BRIGHTEST_HU = -200.0, 1500.0  # beyond is air, or metal
 
-_COARSE_MM = 2.0  # voxels on which heads are looked for
-_RIDGE_MM = 1.5  # standard deviation of the blur before the Hessian
-_RIDGE_HU, _RIDGE_RANGE = 100.0, (-100.0, 800.0)
-_RIDGE_SHARE, _RIDGE_FLAT = 0.4, 0.5  # the strongest so many; |λ₂| at most so much of |λ₃|
-# Of heads (20 to 28 in adults) and of the sockets around them. What fits best at the first or the last is no head: it
-# may fit better still beyond them, as a shaft's end (18) and a condyle of a knee (31) do.
-_RADII_MM = np.arange(18.0, 32.0)
 _CANDIDATES = 40
 _INSIDE_HU = 170.0  # of spongy bone in a head, and of any bone
 _INSIDE_MM = 15.0
@@ -95,9 +95,9 @@ def bones_without_network(ct: Volume, anatomy: Anatomy) -> Volume:
 
 def femoral_heads(ct: Volume) -> list[Head]:
     """None, one, or two femoral heads of a CT in HU, the left one first."""
-    coarse = resample_isotropic(ct, _COARSE_MM)
-    hu = coarse.data.float().clamp(*_RIDGE_RANGE).numpy()
-    votes, radii = _sphere_votes(hu)
+    coarse = resample_isotropic(ct, COARSE_MM)
+    hu = coarse.data.float().clamp(*RIDGE_RANGE_HU).numpy()
+    votes, radii = sphere_votes(hu)
     peaks = np.argwhere((votes == ndimage.maximum_filter(votes, 9)) & (votes > 0))
     peaks = peaks[np.argsort(-votes[tuple(peaks.T)])][:_CANDIDATES]
     bright = (hu > _INSIDE_HU).astype(np.float32)
@@ -124,62 +124,24 @@ def femoral_heads(ct: Volume) -> list[Head]:
     return sorted([first, max(others, key=lambda head: head.score)], key=lambda head: -head.centre[0])
 
 
-def _sphere_votes(hu: Values) -> tuple[Values, Values]:
-    """For each voxel (Z, Y, X) how many sheets of bone face it at one distance, and that distance, mm.
-
-    A Hough transform: the ridges of cortex, also of the socket's, vote along their normals, both ways.
-    """
-    sigma = _RIDGE_MM / _COARSE_MM
-    bone = hu > _RIDGE_HU
-    second = ((2, 0, 0), (1, 1, 0), (1, 0, 1), (0, 2, 0), (0, 1, 1), (0, 0, 2))
-    zz, zy, zx, yy, yx, xx = (ndimage.gaussian_filter(hu, sigma, order)[bone] for order in second)
-    values, vectors = np.linalg.eigh(np.stack([zz, zy, zx, zy, yy, yx, zx, yx, xx], -1).reshape(-1, 3, 3))
-    across, along = -values[:, 0], np.abs(values[:, 1:]).max(1)
-    ridge = (across > 0) & (along < _RIDGE_FLAT * across)
-    ridge &= across >= np.quantile(across, 1 - _RIDGE_SHARE)
-    places, normals = np.argwhere(bone)[ridge], vectors[ridge, :, 0]
-    best, at = np.zeros(hu.shape, np.float32), np.zeros(hu.shape, np.float32)
-    for radius in _RADII_MM:
-        votes = np.zeros(hu.size, np.float32)
-        for way in (radius, -radius):
-            to = np.round(places + normals * way / _COARSE_MM).astype(int)
-            to = to[((to >= 0) & (to < hu.shape)).all(1)]
-            votes += np.bincount(np.ravel_multi_index(tuple(to.T), hu.shape), minlength=hu.size)
-        smooth = ndimage.gaussian_filter(votes.reshape(hu.shape), 1.5) / radius**1.5
-        at[smooth > best] = radius
-        best = np.maximum(best, smooth)
-    return best, at
-
-
 def _in_a_socket(bright: Values, place: NDArray[np.intp]) -> float:
     """How much of the inside of a head there is bone, times the share of directions upwards that meet bone above."""
-    every = _directions()
+    every = directions()
     inside = _along(bright, place, every, 0.0, _INSIDE_MM).mean()
     roof = _along(bright, place, every[every[:, 0] > _ROOF_UP], *_ROOF_MM).mean(1) > _ROOF_SHARE
     return float(inside * roof.mean())
 
 
-def _directions(count: int = 300) -> Points:
-    """Unit vectors (count, 3), evenly spread."""
-    n = np.arange(count) + 0.5
-    up, turn = 1 - 2 * n / count, np.pi * (1 + np.sqrt(5)) * n
-    level = np.sqrt(1 - up**2)
-    return np.stack([up, level * np.sin(turn), level * np.cos(turn)], 1)
-
-
 def _along(
     values: Values,
     place: NDArray[np.intp] | Points,
-    directions: Points,
+    ways: Points,
     first_mm: float,
     last_mm: float,
-    voxel_mm: float = _COARSE_MM,
+    voxel_mm: float = COARSE_MM,
 ) -> Values:
-    """Values (directions, steps) along rays from a voxel."""
-    steps = np.arange(first_mm, last_mm, 1.5) / voxel_mm
-    points = place[:, None, None] + directions.T[:, :, None] * steps
-    result: Values = ndimage.map_coordinates(values, points, order=1, mode="constant")
-    return result
+    """Values (ways, steps) along rays from a voxel, every 1.5 mm."""
+    return along_rays(values, np.asarray(place, float), ways, np.arange(first_mm, last_mm, 1.5) / voxel_mm)
 
 
 def _is_joint(labels: NDArray[np.uint8], head: Head, side: str, grid: Volume, anatomy: Anatomy) -> bool:
@@ -189,7 +151,7 @@ def _is_joint(labels: NDArray[np.uint8], head: Head, side: str, grid: Volume, an
     )
     affine = grid.lps_from_index.numpy()
     place = np.linalg.solve(affine[:3, :3], head.centre - affine[:3, 3])[::-1]
-    every = _directions()
+    every = directions()
     inwards = -every[:, 2] if side == "left" else every[:, 2]
     roof = every[_SOCKET[0] * inwards + _SOCKET[1] * every[:, 0] > _SOCKET_COSINE]
     inside = _along(femur, place, every, 0.0, head.radius - 3, VOXEL_MM).mean()
@@ -199,7 +161,7 @@ def _is_joint(labels: NDArray[np.uint8], head: Head, side: str, grid: Volume, an
 
 def _has_a_radius(head: Head) -> bool:
     """Whether a sphere fits best at a radius between the smallest and the largest that were tried."""
-    return bool(_RADII_MM[0] < head.radius < _RADII_MM[-1])
+    return bool(RADII_MM[0] < head.radius < RADII_MM[-1])
 
 
 def _may_be_pair(one: Head, other: Head) -> bool:
@@ -218,7 +180,7 @@ def _frame(heads: list[Head], grid: Volume) -> _Frame:
         sides = {"left": heads[0], "right": heads[1]}
     else:
         left = np.array([1.0, 0.0, 0.0])
-        side = _side_of(heads[0], resample_isotropic(grid, _COARSE_MM))
+        side = _side_of(heads[0], resample_isotropic(grid, COARSE_MM))
         middle = heads[0].centre - (_HALF_HEADS_MM if side == "left" else -_HALF_HEADS_MM) * left
         sides = {side: heads[0]}
     up = np.array([0.0, 0.0, 1.0]) - left[2] * left
@@ -238,7 +200,7 @@ def _side_of(head: Head, ct: Volume) -> str:
     """Whose head it is: somewhat above a head there is bone, the ilium, on the inner side alone."""
     hu, affine = ct.data.float().numpy(), ct.lps_from_index.numpy()
     place = np.linalg.solve(affine[:3, :3], head.centre - affine[:3, 3])[::-1]
-    slant = _directions()
+    slant = directions()
     slant = slant[(slant[:, 0] > _SLANT[0]) & (slant[:, 0] < _SLANT[1])]
     bright = _along((hu > _INSIDE_HU).astype(np.float32), place, slant, *_SLANT_MM).mean(1)
     return "left" if bright[slant[:, 2] < -_ASIDE].mean() > bright[slant[:, 2] > _ASIDE].mean() else "right"
