@@ -20,7 +20,6 @@ from femoreg_torch.evaluation import ReferencePoints, reference_points
 from femoreg_torch.evaluation.overlay import monitor_picture
 from femoreg_torch.files import new_folder, temporary_file, write_json
 from femoreg_torch.fluoro import StoredImage, read_stored, settled_intensity, write_image
-from femoreg_torch.geometry import Camera
 from femoreg_torch.pictures import write_picture
 from femoreg_torch.volume import read_ct, write_volume
 
@@ -172,13 +171,13 @@ def beads_picture(case: Case, found: Measured) -> np.ndarray:
             grey = np.zeros((*shape, 3), np.uint8) if image is None else monitor_picture(image)
             panel = np.ascontiguousarray(grey[::factor, ::factor])
             if image is not None:
-                _draw(panel, case, found, number, kind, case.carm.camera, factor)
+                _draw(panel, case, found, number, kind, factor)
             panels.append(panel)
         rows.append(np.hstack(panels))
     return np.vstack(rows)
 
 
-def _draw(panel: np.ndarray, case: Case, found: Measured, number: int, kind: str, camera: Camera, factor: int) -> None:
+def _draw(panel: np.ndarray, case: Case, found: Measured, number: int, kind: str, factor: int) -> None:
     centres, radii = _shadows(case, found, number, kind)
     for (column, row), radius in zip(centres.tolist(), radii.tolist(), strict=True):
         middle = (round(column / factor), round(row / factor))

@@ -69,8 +69,6 @@ def with_device(case: Case, device: Device) -> Case:
     return replace(case, objects={**case.objects, DEVICE: _device_object(device)}, plan=plan)
 
 
-def planned(
-    side: Side, entry_point: Tensor, target: Tensor, device: Device | None, file: Path | None = None
-) -> PlannedPath:
+def planned(entry_point: Tensor, target: Tensor, device: Device | None, file: Path | None = None) -> PlannedPath:
     """The drill path (3,), (3,) through the operated femur; `file` is the plan.json that it is from."""
     return PlannedPath(FEMUR, entry_point, target, None if device is None else DEVICE, file)

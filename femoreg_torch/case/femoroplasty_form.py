@@ -98,7 +98,7 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
         raise InputError(f"{top.where('landmarks')}: {head}, the head of the operated femur, is missing.")
     views = tuple(read_view(view, folder) for view in top.mappings("views")) if "views" in top else ()
     entry_point, target, file = read_path(top, folder, landmarks, side)
-    path = checked_path(planned(side, entry_point, target, None), top.where("plan"))
+    path = checked_path(planned(entry_point, target, None), top.where("plan"))
     device = read_device(top.mapping("device"), folder, path, side) if "device" in top else None
     objects = femoroplasty_objects(side, landmarks[head], device)
     display = read_display(top)
@@ -113,7 +113,7 @@ def _read(top: Fields, folder: Path, ct: Fields, bones: LabelTable) -> Case:
         labels_path=ct.file_path("labels", folder, may_be_folder=True) if "labels" in ct else None,
         bones=bones,
         landmarks=landmarks,
-        plan=planned(side, entry_point, target, device, file),
+        plan=planned(entry_point, target, device, file),
         truth=truth,
         truth_source=truth_source,
         template=TEMPLATE,

@@ -98,14 +98,11 @@ def _check_picture(out: Path, source: Path) -> None:
 
 def write_picture(path: Path, picture: "Picture") -> None:
     """Write a picture (PNG or JPEG, by its name), whole or not at all."""
-    import cv2
-
+    from femoreg_torch import pictures
     from femoreg_torch.files import temporary_file
 
-    written, content = cv2.imencode(path.suffix, picture)
-    assert written
     with temporary_file(path) as part:
-        part.write_bytes(content.tobytes())
+        pictures.write_picture(part, picture)
 
 
 def new_case(

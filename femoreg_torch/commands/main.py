@@ -57,9 +57,10 @@ _RANGES = {  # of options that have one meaning in all commands
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `femoreg` with these arguments (those of the process if None) and return its exit status.
 
-    0: done; 1: a run of a study failed; 2: bad input, told in one line on stderr, or `doctor` found something amiss;
-    3: done, but not trusted; 130: interrupted. Whatever else goes wrong is a defect: it is told in one line too, with
-    status 2, and keeps its traceback where the environment has FEMOREG_TRACEBACK.
+    0: done; 1: a run of a study failed, or `check` found something wrong; 2: bad input, told in one line on stderr, a
+    case of a batch that was refused or failed, or what `doctor` found amiss; 3: done, but not trusted; 130:
+    interrupted. Whatever else goes wrong is a defect: it is told in one line too, with status 2, and keeps its
+    traceback where the environment has FEMOREG_TRACEBACK.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands = {command.name: command for command in entry_points(group=GROUP)}

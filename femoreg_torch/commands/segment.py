@@ -32,10 +32,10 @@ def segment(
     from rich.markup import escape
 
     from femoreg_torch.anatomy import HIP
-    from femoreg_torch.commands.intake import write_picture
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import check_files, temporary_files, write_json
     from femoreg_torch.intake.planes import planes_through_joints
+    from femoreg_torch.pictures import write_picture
     from femoreg_torch.segment import load_bone_network, segment_bones, segment_bones_without_network
     from femoreg_torch.volume import read_ct_told
     from femoreg_torch.volume.reading import write_labels_like

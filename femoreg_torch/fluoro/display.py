@@ -86,7 +86,7 @@ class Display:
         return (upright.flip(-1) if self.flipped else upright).contiguous()
 
     def to_stored(self, image: Tensor) -> Tensor:
-        """The inverse of `to_camera`."""
+        """The inverse of `to_camera`: what the source sees (..., H, W) as a stored picture."""
         upright = image.flip(-1) if self.flipped else image
         return torch.rot90(upright, -self._quarters, (-2, -1)).contiguous()
 
@@ -110,7 +110,7 @@ class Display:
         return torch.stack([columns[0] - 1 - column if self.flipped else column, row], -1)
 
     def pixels_to_stored(self, pixels: Tensor, camera: Camera) -> Tensor:
-        """The inverse of `pixels_to_camera`."""
+        """The inverse of `pixels_to_camera`: places (..., 2) in a stored picture."""
         columns = camera.shape[::-1]
         column, row = pixels.unbind(-1)
         column = columns[0] - 1 - column if self.flipped else column

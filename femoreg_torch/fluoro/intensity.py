@@ -54,13 +54,13 @@ def below_zero(raw: Tensor, padding: Tensor | None = None) -> str | None:
 
 
 def check_intensity(raw: Tensor, where: str) -> None:
-    """Raises `InputError` that starts with `where` if no pixel of a raw image is positive."""
+    """Raises `InputError` that starts with `where` if no pixel of a raw image (H, W) is positive."""
     if not raw.max() > 0:
         raise InputError(f"{where}: no pixel is positive, a raw intensity image was expected. Is its intensity `log`?")
 
 
 def raised(raw: Tensor) -> str | None:
-    """In words, an offset that seems to have been added to all values of a raw image: nothing in it is near black."""
+    """In words, an offset that seems to be in all values of a raw image (H, W): nothing in it is near black."""
     low, high = (float(value) for value in raw.aminmax())
     if low <= _RAISED * high:
         return None

@@ -222,7 +222,10 @@ def settled_intensity(said: Literal["raw", "log"] | None, image: StoredImage, wh
 
 
 def write_image(path: Path, image: Tensor) -> None:
-    """Write a 16-bit grey image (H, W), dtype uint16, as TIFF or PNG by the suffix of `path`."""
+    """Write a 16-bit grey image (H, W), dtype uint16, as TIFF or PNG by the suffix of `path`.
+
+    Raises `InputError` for another shape, dtype or suffix.
+    """
     path = Path(path)
     if image.dtype != torch.uint16 or image.ndim != 2 or path.suffix.lower() not in PICTURE_SUFFIXES:
         raise InputError(f"{path}: a (H, W) uint16 image and a name in {', '.join(PICTURE_SUFFIXES)} were expected.")

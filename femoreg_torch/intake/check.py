@@ -145,7 +145,7 @@ def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAn
 
 def _path(top: Fields, folder: Path, marks: dict[str, Tensor], side: Side) -> PlannedPath:
     entry_point, target, _ = femoroplasty_form.read_path(top, folder, marks, side)
-    return planned(side, entry_point, target, None)
+    return planned(entry_point, target, None)
 
 
 def _check_device(top: Fields, folder: Path, path: PlannedPath | None, side: Side | None, found: Found) -> None:

@@ -66,6 +66,7 @@ class SeenAnatomy:
 
 
 def check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: Found) -> SeenAnatomy:
+    """CT and label map of a femoroplasty, and what is wrong with them, for `found`; `marks` (3,), LPS mm, by name."""
     path = found.attempt(lambda: ct.file_path("image", folder, may_be_folder=True))
     labels_path = None
     if "labels" not in ct:
@@ -90,6 +91,7 @@ def check_ct(ct: Fields, folder: Path, marks: dict[str, Tensor], found: Found) -
 def check_bones(
     path: Path, ct: Volume, table: LabelTable, anatomy: Anatomy | None, marks: Mapping[str, Tensor], found: Found
 ) -> BoneLabels:
+    """The bones of a label map on the grid of a CT, HU, and what contradicts that, for `found`. Raises `InputError`."""
     wanted = {n for ids in table.values() for n in ids}
     labels, told = read_labels_told(path, ct, wanted)
     found.warnings += [*told, *(f"{path.name}: {warning}" for warning in header_warnings(path))]
@@ -125,6 +127,7 @@ def some_of(names: list[str]) -> str:
 
 
 def check_landmarks(seen: SeenAnatomy, found: Found) -> None:
+    """What is wrong with landmarks of the CT, for `found`: their number, the CT's border, sides, places off bones."""
     if seen.landmarks and len(seen.landmarks) < MINIMUM:
         found.warnings.append(f"landmarks: {len(seen.landmarks)} of them; {_of_few(seen)}.")
     outside = set()

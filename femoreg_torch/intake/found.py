@@ -28,6 +28,7 @@ class Found:
             return None
 
     def problem(self, told: str) -> None:
+        """Keep a problem, in one line, unless it is known."""
         line = " ".join(told.split())
         if line not in self.problems:
             self.problems.append(line)

@@ -33,8 +33,8 @@ class LevenbergMarquardt:
     better, is given up: it would end there too.
 
     An objective that is drawn from voxels ripples. Where it is soft, ripples hold a descent up well before the minimum
-    of what lies beneath. With `valley` the search goes on: along each of the three directions of least curvature, to the
-    minimum of the parabola through the values there and so far to both sides, where ripples weigh little.
+    of what lies beneath. With `valley` the search goes on: along each of the three directions of least curvature, to
+    the minimum of the parabola through the values there and so far to both sides, where ripples weigh little.
     """
 
     max_iterations: int = 20  # per start

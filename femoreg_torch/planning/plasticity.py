@@ -35,8 +35,7 @@ class Response:
     state: State
     share: Array  # (E, 8) yield over trial stress, 1 where elastic
     normal: Array  # (E, 8, 6) direction of the deviatoric stress, tensor components, of norm 1
-    mean_stress: Array  # (E, 8)
-    mises: Array  # (E, 8)
+    mises: Array  # (E, 8) equivalent stress after the return
 
 
 class Plasticity:
@@ -76,7 +75,7 @@ class Plasticity:
         made_force = (stress.reshape(count, 48) @ made.deviator.reshape(48, 24)) / 8
         force = made_force + pressure.mean(1)[:, None] * made.dilatation
         after = State(state.strain + flow, state.equivalent + np.sqrt(2 / 3) * _norm(flow))
-        return Response(force, after, share, normal, pressure, share * mises)
+        return Response(force, after, share, normal, share * mises)
 
     def tangent(self, response: Response) -> Array:
         """Consistent stiffness (E, 24, 24) of elements of edge 1; that of a pressure-dependent yield is left out.

@@ -69,9 +69,9 @@ class PoseCovariance:
     intrinsics: "IntrinsicsEstimate"
     step: Tensor  # (6 B,): where all images together would move the bodies, were all free with these intrinsics
     motions: tuple[MotionBetween, ...] = ()  # of the anatomy between kinds of images, were it free to move
-    drifts: tuple[MotionBetween, ...] = ()  # of what other kinds of images show alone, in single views
+    drifts: tuple[MotionBetween, ...] = ()  # of every object beside the anchor, in single views
     guide_drifts: tuple[GuideDrift, ...] = ()  # of tools in single views
-    joint_turns: tuple[JointTurn, ...] = ()  # of bones in single views
+    joint_turns: tuple[JointTurn, ...] = ()  # of bones that start beside the anchor, in single views
 
     def of(self, first: str, second: str | None = None) -> Tensor:
         """The block (6, 6) of one body, or of two."""
@@ -117,7 +117,7 @@ class PoseCovariance:
         return self.step[i : i + 6]
 
     def pull_beside(self, name: str, other: str) -> Tensor:
-        """The same of one object, seen from another: what moves both together does not count."""
+        """The motion (6,) as of `pull`, of one object seen from another: what moves both together does not count."""
         return self._beside(name, other, self.centre(name)) @ self.step
 
     def _beside(self, name: str, other: str, point: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ def below_white(integrals: Tensor, white: Tensor | None) -> Tensor:
 
 
 def below_white_slope(integrals: Tensor, white: Tensor) -> Tensor:
-    """The derivative of `below_white` by the integrals."""
+    """The derivative of `below_white` by the integrals (..., H, W)."""
     squared = (integrals / _FAINT) ** 2
     return torch.where(white, 2 * squared * (-squared).exp() - torch.expm1(-squared), 1)
 
@@ -73,7 +73,7 @@ def filled(integrals: Tensor, scatter: Tensor | None) -> Tensor:
 
 
 def filled_slope(integrals: Tensor, scatter: Tensor | None) -> Tensor:
-    """The derivative of `filled` by the integrals."""
+    """The derivative of `filled` by the integrals (..., H, W)."""
     return torch.ones_like(integrals) if scatter is None else 1 / (1 + scatter * integrals.exp())
 
 
@@ -91,7 +91,7 @@ def hardened(integrals: Tensor, hardening: float) -> Tensor:
 
 
 def hardened_slope(image: Tensor, hardening: float) -> Tensor:
-    """The derivative of `hardened` by the integrals, 1 / (1 + h L), from what they came to."""
+    """The derivative of `hardened` by the integrals, 1 / (1 + h L), from what they came to (..., H, W)."""
     return (-hardening * image.clamp_min(0)).exp()
 
 

@@ -58,8 +58,8 @@ def model_end(points: Mapping[str, Tensor]) -> Tensor:
 def told_of_end(name: str, volume: Volume, points: Mapping[str, Tensor]) -> tuple[str, ...]:
     """In words, a tip before or beyond the end of the model of an object along its guide, if no point `end` says so.
 
-    It may be meant so: a drill stands out of a sleeve, or cement leaves a needle at its side. A model that was exported
-    from another origin looks the same.
+    `volume` is its attenuation (1/mm), `points` (3,) mm are in its space. It may be meant so: a drill stands out of a
+    sleeve, or cement leaves a needle at its side. A model that was exported from another origin looks the same.
     """
     if not {"base", "tip"} <= set(points):
         return ()

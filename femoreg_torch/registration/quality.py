@@ -78,7 +78,6 @@ def assess(
     """Quality of every object placed in `poses`, drawn with `imaging`: in every view the first kind that shows it.
 
     A view that has no image which shows an object says nothing about it.
-
     `trace` is that of the steps which led there, `covariance` that of `final_covariance`, if it is known already.
     """
     covariance = covariance or final_covariance(scene, poses, imaging)

@@ -66,7 +66,7 @@ def touching_faces(owner: Tensor) -> Indices:
 
 
 def filled(share: Volume, owner: Tensor, values: Doubles) -> Volume:
-    """A volume with the values of K regions: that of the region of every voxel, −1 where it is empty, times a share."""
+    """A volume of the `values` (K,) of regions: each voxel's share times that of its `owner` (Z, Y, X), 0 where −1."""
     inside = share.data.contiguous().numpy()
     return share.with_data(torch.from_numpy(_filled(inside, owner.contiguous().numpy(), values.astype(np.float32))))
 
@@ -130,7 +130,7 @@ class RegionVoxels:
 
 
 def region_voxels(share: Volume, owner: Tensor, count: int) -> RegionVoxels:
-    """The voxels of K regions of a volume that holds the share of every voxel in it."""
+    """The voxels of `count` regions, told by `owner` (Z, Y, X), of a volume that holds the share of each in it."""
     where = share.data.nonzero()
     region = owner[where.unbind(1)].numpy()
     where = where[torch.from_numpy(np.argsort(region, kind="stable"))]

@@ -87,6 +87,7 @@ def device_of(
     *,
     sharp: bool = False,
 ) -> Device:
+    """A device whose regions are told by their `owner` (Z, Y, X), −1 where it is empty; all else as in `Device`."""
     return Device(name, kind, share, owner, regions, region_voxels(share, owner, regions), touching, told, sharp)
 
 

@@ -126,8 +126,8 @@ class Stage:
     """One optimisation. `images` says which views take part: the first, each other view by itself, or all together.
 
     Objects are named as in the scene; [all] in `render` or `kinds` stands for all. Of the images of these kinds, those
-    that there are take part. `weights` says which pixels count,
-    see `pixel_weights`; by default all do. `imaging` says what is drawn besides the objects; by default nothing.
+    that there are take part. `weights` says which pixels count, see `pixel_weights`; by default all do. `imaging` says
+    what is drawn besides the objects; by default nothing.
     """
 
     name: str

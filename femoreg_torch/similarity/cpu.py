@@ -8,7 +8,6 @@ _flags = {"contract", "reassoc", "nsz", "arcp"}
 _jit = nb.njit(cache=True, fastmath=_flags, error_model="numpy")
 _parallel = nb.njit(cache=True, fastmath=_flags, error_model="numpy", parallel=True, nogil=True)
 
-Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 
 

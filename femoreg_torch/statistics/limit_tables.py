@@ -84,8 +84,8 @@ def limit_table(rows: pd.DataFrame, bounds: pd.DataFrame) -> Table:
     note = (
         "Root mean squares over the runs that gave the error, and over their bounds. Bounds: the least that the noise "
         "of photons and electronics allows, with more and more unknown beside the poses. Ratio: error by the bound "
-        f"`{USUAL}`. Noise alone: the last stage on images that show what it draws, with photon noise, of "
-        f"{noisy['number'].nunique()} procedures; – where none was registered."
+        f"`{USUAL}`. Noise alone: the last stage that moves all, on images that show what it draws, with photon noise, "
+        f"of {noisy['number'].nunique()} procedures; – where none was registered."
     )
     columns = ("", "runs", "error", "noise alone", *(f"bound, {kind}" for kind in kinds), "ratio")
     return Table("limits", "How far from the limit", note, columns, tuple(lines), pd.DataFrame(data))

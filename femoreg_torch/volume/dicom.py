@@ -56,10 +56,11 @@ class Slice:
 
     @property
     def is_scout(self) -> bool:
+        """Whether it is a localiser, by ImageType (DICOM PS3.3, C.8.2.1)."""
         return "LOCALIZER" in [str(word).upper() for word in self.header.get("ImageType") or []]
 
     def numbers(self, name: str, count: int) -> NDArray[np.float64] | None:
-        """The numbers of a tag, or None where it is missing or holds something else."""
+        """The `count` numbers of a tag, (count,); None where it is missing or holds something else."""
         value = self.header.get(name)
         try:
             numbers = np.asarray(value, np.float64)

@@ -61,7 +61,7 @@ class Volume:
         return (along.abs() - half).clamp_min(0).norm().item()
 
     def with_data(self, data: Tensor) -> "Volume":
-        """Other values on the same grid."""
+        """Other values (Z, Y, X) on the same grid. Raises `InputError` for another shape."""
         if data.shape != self.data.shape:
             raise InputError(f"volume: {tuple(data.shape)} values do not fit a {tuple(self.data.shape)} grid.")
         return Volume(data, self.lps_from_index)

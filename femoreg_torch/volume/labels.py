@@ -44,7 +44,7 @@ def label_box(labels: Volume, ids: Sequence[int]) -> tuple[Corner, Corner]:
         _boxes[labels] = changes_in_place(labels.data), boxes
     found = [box for n in ids if n <= len(boxes) and (box := boxes[n - 1]) is not None]
     if not found:
-        raise InputError(f"label map: no voxel carries any of the labels {list(ids)}. Check `structures` against it.")
+        raise InputError(f"label map: no voxel carries any of the labels {list(ids)}. Check `ct.bones` against it.")
     x, y, z = ((min(box[axis].start for box in found), max(box[axis].stop for box in found)) for axis in (2, 1, 0))
     return (x[0], y[0], z[0]), (x[1], y[1], z[1])
 

@@ -94,7 +94,7 @@ def _fcsv_points(path: Path) -> list[_Given]:
     values = ["" if _is_remark(line) else line for line in lines]
     separator = separator_of(values, max(columns.index(name) for name in needed) + 1)
     rows = list(rows_of(values, columns, needed, separator, str(path)))
-    return _of_rows(rows, {_SPACES.get(space.upper(), space): ("x", "y", "z")}, "label", path)
+    return _of_rows(rows, {_SPACES.get(space.upper(), space): ("x", "y", "z")}, path)
 
 
 def _is_remark(line: str) -> bool:
@@ -112,14 +112,14 @@ def _csv_points(path: Path) -> list[_Given]:
             f"{shortened(', '.join(rows[0].values), 80)}. Other names do not say which way x, y and z run."
         )
     placed = [row for row in rows if row.values.get("defined", "1") not in ("0", "false")]
-    return _of_rows(placed, axes, "label", path)
+    return _of_rows(placed, axes, path)
 
 
-def _of_rows(rows: list[Row], axes: Mapping[str, tuple[str, ...]], label: str, path: Path) -> list[_Given]:
+def _of_rows(rows: list[Row], axes: Mapping[str, tuple[str, ...]], path: Path) -> list[_Given]:
     ((space, columns),) = axes.items()
     check_decimal_marks(rows, columns, str(path))
     return [
-        _Given(space, row.values[label], [_number(row.values[name]) for name in columns], f"line {row.line}, ")
+        _Given(space, row.values["label"], [_number(row.values[name]) for name in columns], f"line {row.line}, ")
         for row in rows
     ]
 

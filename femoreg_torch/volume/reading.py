@@ -86,7 +86,8 @@ def read_volume(path: Path) -> Volume:
 def read_volume_told(path: Path, series: str | None = None) -> tuple[Volume, tuple[str, ...]]:
     """As `read_volume`, and what had to be done to it in words.
 
-    `series` names one of several DICOM series: its number, its UID or a part of its description.
+    `series` names one of several DICOM series: its number, its UID or a part of its description. Raises `InputError` as
+    `read_volume` does.
     """
     image, told = _read(Path(path), series)
     image = _oriented(image, path)
@@ -103,7 +104,7 @@ def read_ct(path: Path) -> Volume:
 
 
 def read_ct_told(path: Path, series: str | None = None) -> tuple[Volume, tuple[str, ...]]:
-    """As `read_ct`, and what had to be done to it in words; `series` as for `read_volume_told`."""
+    """As `read_ct`, and what had to be done to it in words; `series` as for `read_volume_told`. Raises `InputError`."""
     volume, told = read_volume_told(path, series)
     lowest, highest = (v.item() for v in volume.data.aminmax())
     if lowest == highest:

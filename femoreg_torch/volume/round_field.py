@@ -24,7 +24,7 @@ class RoundField:
     radius_mm: float
 
     def within_mm(self, x_mm: Tensor, y_mm: Tensor) -> Tensor:
-        """How far places lie within the circle, along the volume's axes; negative beyond it."""
+        """How far, mm, places along the volume's axes lie within the circle; negative beyond it. Of any one shape."""
         return self.radius_mm - torch.hypot(x_mm - self.middle_mm[0], y_mm - self.middle_mm[1])
 
 

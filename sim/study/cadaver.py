@@ -293,7 +293,7 @@ def _by_hand(
     return found.poses, metric_deviations(pose_uncertainty(found, points), found.poses, points)
 
 
-def write_results(study: CadaverStudy, records: dict[str, dict[str, Any]], out: Path) -> str:
+def write_results(records: dict[str, dict[str, Any]], out: Path) -> str:
     """Write the rows as CSV; returns the tables as Markdown."""
     with temporary_file(out / "cadaver.csv") as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -356,4 +356,4 @@ def cadaver(settings: str = "cadaver", out: Path = Path("out/cadaver")) -> None:
     for number, name in enumerate(_ROMAN[: study.trials]):
         print(f"trial {name}: beads and registration", flush=True)
         records[name] = run_trial(study, out / "trials" / name, out / "measured" / name, number)
-    print(write_results(study, records, out))
+    print(write_results(records, out))

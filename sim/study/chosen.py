@@ -43,6 +43,10 @@ class Chosen:
 def chosen_of(
     name: str, preset: str, first: int | None, kind: Kind, out: Path, patients: Path | None, data: Path
 ) -> Chosen:
+    """The first so many procedures of a protocol with patients of a kind, and where their cases are kept, below `out`.
+
+    `patients` are CTs around real bone shapes (OUT/patients if None), made from the meshes in `data`.
+    """
     protocol = replace(load_protocol(name), preset=preset)
     every = protocol.first(protocol.procedures, real=True)
     fitting = [p for p in every if kind in ("all", "procedural" if p.procedural else "real")]
@@ -52,6 +56,7 @@ def chosen_of(
 
 
 def make_cases(chosen: Chosen, jobs: int) -> None:
+    """Make those of the kept cases that are missing, under every condition, in so many processes."""
     settings = list(chosen.settings.values())
     variations = [setting.variation for setting in settings]
     make_conditions(chosen.procedures, variations, settings[0].simulation, chosen.stores, chosen.imaged, jobs)
@@ -75,4 +80,5 @@ def carried_out(
 
 
 def earlier_name(run: Run) -> str:
+    """The name of a run's record as versions before the engine wrote it."""
     return f"{run.procedure.name}.json"

@@ -53,7 +53,7 @@ def register_case(
         return {"refused": str(error), "trusted": False, "reasons": []}, None
     if overlay is not None:
         _write_overlay(overlay, overlay_figure(case, scene, result.poses))
-    return plain({"refused": None} | _told(case, result, scene) | _measured(case, scene, result)), result
+    return plain({"refused": None} | _told(case, result) | _measured(case, scene, result)), result
 
 
 def _write_overlay(path: Path, picture: Picture) -> None:
@@ -117,7 +117,7 @@ def _asked(truth: Poses, scene: Scene) -> list[str]:
     return [name for name in truth.camera1_from if scene.there(scene.objects[name].shown_in, range(scene.views))]
 
 
-def _told(case: Case, result: Result, scene: Scene) -> dict[str, Any]:
+def _told(case: Case, result: Result) -> dict[str, Any]:
     """What a result says of itself."""
     assert result.start is not None
     others = {f"camera1_from_{name}": pose for name, pose in result.poses.camera1_from.items() if name != result.anchor}

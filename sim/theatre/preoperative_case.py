@@ -74,7 +74,7 @@ def read_preoperative(folder: Path, side: Side, seed: int, settings: Simulation,
     head, femur = case.landmarks[name], case.bones[bone]
     path = case.plan if case.side == side else None
     if path is None:
-        path = _planned(case, side, head, femur, ct_path, labels_path)
+        path = _planned(case, head, femur, ct_path, labels_path)
     device = _at_nominal_pose(device_of(case) or _write_device(seed, device_path), path, head, side, settings)
     case = replace(
         case,
@@ -106,13 +106,11 @@ def _bare(folder: Path) -> Case:
     )
 
 
-def _planned(
-    case: Case, side: Side, head: Tensor, femur: tuple[int, ...], ct_path: Path, labels_path: Path
-) -> PlannedPath:
-    """A path for this side, from the lateral cortex along the neck into the centre of the head."""
+def _planned(case: Case, head: Tensor, femur: tuple[int, ...], ct_path: Path, labels_path: Path) -> PlannedPath:
+    """A path from the lateral cortex along the neck into the centre of the head."""
     ct = read_ct(ct_path)
     check_inside(case.landmarks, ct)
-    return planned(side, neck_axis_entry(read_labels(labels_path, ct), femur, head), head, None)
+    return planned(neck_axis_entry(read_labels(labels_path, ct), femur, head), head, None)
 
 
 def _write_device(seed: int, path: Path) -> Device:

@@ -44,7 +44,7 @@ def bones(moved: Tensor | None = None) -> BoneLabels:
 
 def case(left: Tensor, right: Tensor) -> Case:
     landmarks = {"FH-l": left, "FH-r": right}
-    plan = planned("left", left + torch.tensor([40.0, 0, -60]).double(), left, None)
+    plan = planned(left + torch.tensor([40.0, 0, -60]).double(), left, None)
     femur = CaseObject("femur", bones=("femur_left",))
     return Case(Path("case"), load_carm("cios_fusion"), {"femur": femur}, (), landmarks=landmarks, plan=plan)
 

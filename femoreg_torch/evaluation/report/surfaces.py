@@ -45,7 +45,7 @@ def theatre(case: Case, scene: Scene, result: Result, drawn: Drawn) -> dict[str,
     centre = transform_points(poses.camera1_from[scene.anchor], scene.objects[scene.anchor].reference_point[None])[0]
     return {
         "meshes": meshes,
-        "views": [_view(scene, result, drawn, view) for view in range(scene.views)],
+        "views": [_view(result, drawn, view) for view in range(scene.views)],
         "labels": list(_labels(case, scene, result)),
         "centre": [round(value, 1) for value in centre.tolist()],
         "beam": hexadecimal(_BEAM_COLOUR),
@@ -123,7 +123,7 @@ def _rod(name: str, start: Array, end: Array, colour: str) -> dict[str, Any]:
     return _mesh(name, np.asarray(rod.vertices), np.asarray(rod.faces), colour, 1.0)
 
 
-def _view(scene: Scene, result: Result, drawn: Drawn, view: int) -> dict[str, Any]:
+def _view(result: Result, drawn: Drawn, view: int) -> dict[str, Any]:
     """Source, the four corners of the detector (clockwise from the first pixel) and the first image of a view."""
     camera1_from_camera = invert_rigid(result.poses.camera_from_camera1[view])
     corners = torch.cat([torch.zeros(1, 3, dtype=torch.float64), _detector_corners(drawn.cameras[view])])
