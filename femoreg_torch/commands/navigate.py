@@ -1,6 +1,10 @@
 """`femoreg navigate RUN`: what a registration means for the robot."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from femoreg_torch.case import Result
 
 
 def navigate(run: Path, *, robot: Path | None = None) -> None:
@@ -9,7 +13,8 @@ def navigate(run: Path, *, robot: Path | None = None) -> None:
     Writes into RUN: navigation.json, and navigation/ with every transform as 4×4 text (.txt) and as an ITK transform
     (.tfm) for 3D Slicer and SimpleITK. A matrix `b_from_a` takes points of frame a to frame b, in mm. A .tfm is in
     ITK's direction: under it in 3D Slicer, a model of frame a appears in frame b. `femoreg register` writes the same
-    files; this command writes them anew, with the robot's calibration if it was not known then.
+    files; this command writes them anew, with the robot's calibration if it was not known then. It refuses where the
+    plan of the case was changed since.
 
     Args:
         run: Folder that `femoreg register` wrote.
@@ -32,6 +37,7 @@ def navigate(run: Path, *, robot: Path | None = None) -> None:
     )
 
     result = read_result(run)
+    _check_plan(run, result)
     tool = (result.path and result.path[1]) or "device"
     calibration = None if robot is None else read_robot(robot, tool)
     try:
@@ -44,3 +50,13 @@ def navigate(run: Path, *, robot: Path | None = None) -> None:
     for line in summary(content):
         console.print(line)
     console.print(f"Written to {run / NAVIGATION_NAME} and {run / 'navigation'}")
+
+
+def _check_plan(run: Path, result: "Result") -> None:
+    """Raises `InputError` if the case that was registered, where it still stands there, has another plan by now."""
+    from femoreg_torch.case import read_case
+    from femoreg_torch.case.reading import CASE_NAME
+    from femoreg_torch.evaluation.fit import check_plan_fits
+
+    if result.case is not None and (run / result.case / CASE_NAME).is_file():
+        check_plan_fits(read_case(run / result.case), result)

@@ -185,6 +185,11 @@ def check_rigid(transform: Tensor, where: str) -> Tensor:
     rotation = transform[:3, :3]
     bottom = transform.new_tensor([0.0, 0.0, 0.0, 1.0])
     gap = (rotation @ rotation.T - torch.eye(3, dtype=rotation.dtype)).abs().max().item()
+    if (transform[3] - bottom).abs().max() > _ROUNDED and torch.equal(transform[:, 3], bottom):
+        raise InputError(
+            f"{where}: not a rigid transform, as its translation stands in the last row. Transpose it: x y z 1 is the "
+            "last column."
+        )
     if (transform[3] - bottom).abs().max() > _ROUNDED or gap > _ROUNDED:
         raise InputError(
             f"{where}: not a rigid transform (its rotation is off orthonormal by {gap:.2g}, its last row is "

@@ -97,7 +97,12 @@ def hardly_shown(scene: Scene, poses: Poses, names: Sequence[str]) -> tuple[str,
         inside = (volume.data > volume.data.max() / 2).nonzero().cpu().flip(1).double()
         points = transform_points(poses.camera_from(name)[0] @ volume.lps_from_index, inside)
         share = float(_in_picture(project_points(scene.carm.camera, points), scene.carm.camera).double().mean())
-        if share < _LEAST_SHOWN:
+        if share == 0:
+            found.append(
+                f"{name}: where it is meant to stand, nothing of it lies in the picture of view 1. Its start pose is "
+                "to lead from its space to camera 1: is it the inverse?"
+            )
+        elif share < _LEAST_SHOWN:
             found.append(
                 f"{name}: where it is meant to stand, {share:.0%} of it lies in the picture of view 1. If the images "
                 "show no more, its turn about a round guide stays open: take views that show more of it"

@@ -121,7 +121,7 @@ def doubts(
     questions: list[Callable[[], tuple[str, ...]]] = [
         lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
-        lambda: doubts_about_motion(covariance),
+        lambda: doubts_about_motion(covariance, given=scene.camera_from_camera1 is not None),
         lambda: doubts_about_the_plan(case, scene),
         lambda: doubts_about_the_guide(case, poses),
         lambda: doubts_about_the_models(told, scene, poses),
@@ -158,6 +158,11 @@ def doubts_about_the_images(scene: Scene, poses: Poses, imaging: Imaging) -> tup
             told.append(
                 f"{what} does not show what the other image of that view shows {beside}: check that both were taken "
                 "without moving C-arm or patient, and that no images are exchanged"
+            )
+        elif scene.camera_from_camera1 is not None:
+            told.append(
+                f"{what} does not fit at the pose that the case gives {beside}: check `camera_from_camera1` of the "
+                "views (from camera 1 to that view's, in mm, not the inverse), and that the image shows the same hip"
             )
         else:
             told.append(
@@ -233,8 +238,10 @@ def doubts_about_the_views(scene: Scene, poses: Poses) -> tuple[str, ...]:
     return tuple(told)
 
 
-def doubts_about_motion(covariance: PoseCovariance) -> tuple[str, ...]:
+def doubts_about_motion(covariance: PoseCovariance, *, given: bool = False) -> tuple[str, ...]:
     """Anatomy that lies elsewhere in images of another kind, or a device that moved between the views, in words.
+
+    Where the poses of the C-arm were `given`, these may be off as well.
 
     Where both explain the images, what explains them better. A single bone or device counts if it is sure by itself:
     the depth of a bone in one view is so open that it may gain more where a device has moved.
@@ -244,26 +251,28 @@ def doubts_about_motion(covariance: PoseCovariance) -> tuple[str, ...]:
         moved.append(max(covariance.motions, key=lambda each: each.gain))
     if not moved:
         return doubts_about_joints(covariance) or doubts_about_guides(covariance)
+    or_given = ", or the poses that the case gives (`camera_from_camera1`) are off" if given else ""
     found = max(moved, key=lambda each: each.gain)
     deg, mm = found.size
     view = f" of view {found.views[0] + 1}"
     if found in covariance.drifts and found.kind is None:
         return (
             f"in view {found.views[0] + 1}, the {found.objects[0]} lies {mm:.1f} mm and {deg:.1f}° from where the "
-            "other views show it: it has moved between the views (a leg that turned?); take them again",
+            f"other views show it: it has moved between the views (a leg that turned?){or_given}; take them again",
         )
     if found in covariance.drifts:
         return (
             f"in the {found.kind} image{view}, the {found.objects[0]} lies elsewhere than in those of the other views: "
-            "it has moved between the views, or the C-arm's distance or pixels differ in that view; hold it still and "
-            "take them again",
+            f"it has moved between the views, or the C-arm's distance or pixels differ in that view{or_given}; hold it "
+            "still and take them again",
         )
     where = "" if len(found.views) > 1 else view
     who = "the patient or the C-arm" if where or len(found.objects) > 1 else f"the {found.objects[0]}"
     lies = " and ".join(found.objects)
     return (
         f"in the {found.kind} images{where}, {lies} lie{'s' if len(found.objects) == 1 else ''} {mm:.1f} mm and "
-        f"{deg:.1f}° from where the other images show them: {who} has moved between the images; take them again",
+        f"{deg:.1f}° from where the other images show them: {who} has moved between the images{or_given}; take them "
+        "again",
     )
 
 

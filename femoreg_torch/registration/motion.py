@@ -27,6 +27,7 @@ Image = tuple[Kind, int]
 # side, which was right, would have gained by going 18 mm deeper.
 _REACH = 3.0
 _FLAT = 1e-12  # of the strongest curvature: rounding
+_NO_DEVIATION = 1e-9  # degrees or mm: less is rounding, and what did not move by more did not move
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ class MotionBetween:
     @cached_property
     def sureness(self) -> float:
         """The motion by its standard deviations: the most certain of its six parts."""
-        return float((self.motion.abs() / self.deviation).max())
+        return float((self.motion.abs() / self.deviation.clamp_min(_NO_DEVIATION)).max())
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,7 @@ def turns_in_joints(
         moves = _moves([n], centres)[:, :3]
         for view in views:
             turn, deviation, gain = _step(parts, [each == view for _, each in images], moves)
-            sureness = float((turn.abs() / deviation).max())
+            sureness = float((turn.abs() / deviation.clamp_min(_NO_DEVIATION)).max())
             found.append(JointTurn(view, name, float(turn.norm()), sureness, gain))
     return tuple(found)
 

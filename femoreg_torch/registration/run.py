@@ -1,5 +1,7 @@
 """One case registered, from its folder to a `Result`."""
 
+import itertools
+import math
 import platform
 import time
 from collections.abc import Mapping
@@ -17,7 +19,7 @@ from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.detect import detect, load_network
 from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.geometry import CArm, Poses, check_rigid
+from femoreg_torch.geometry import CArm, Poses, check_rigid, invert_rigid, rotation_angle
 from femoreg_torch.registration.another_view import start_from_a_view
 from femoreg_torch.registration.device_doubts import notes_on_unseen_tips
 from femoreg_torch.registration.display_told import doubts_about_the_display
@@ -35,6 +37,8 @@ from femoreg_torch.registration.start import (
 )
 from femoreg_torch.registration.turn_search import turned_from_where_told
 from femoreg_torch.registration.workflow import Follow, Report, run_plan
+
+_ONE_PLACE_DEG, _ONE_PLACE_MM = 2.0, 30.0  # of views and sources: so near, they tell next to nothing of depth
 
 
 def versions() -> dict[str, str]:
@@ -180,6 +184,7 @@ def register_scene(
             *outcome.skipped,
             *_unchecked(case, scene, began),
             *notes_on_unseen_tips(case, scene, outcome.poses),
+            *notes_on_the_views(scene, outcome.poses),
             *notes_on_the_carm(case.carm, outcome.poses),
         ),
         path=None if case.plan is None else (case.plan.object, case.plan.tool),
@@ -211,6 +216,27 @@ def _unchecked(case: Case, scene: Scene, start: StartRecord) -> tuple[str, ...]:
         return ()
     told = "" if scene.outline is not None else ", as the label map does not tell them apart"
     return (f"the start ({start.source}) was not compared with the outlines of the bones{told}",)
+
+
+def notes_on_the_views(scene: Scene, poses: Poses) -> tuple[str, ...]:
+    """Objects that one view alone shows, and views that were taken from one place, in words."""
+    told = []
+    for name, thing in scene.objects.items():
+        views = {view for _, view in scene.there(thing.shown_in, range(scene.views))}
+        if len(views) == 1:
+            told.append(
+                f"one view alone shows {name}: how far along the beam it lies is told by its size in the picture, and "
+                "little else"
+            )
+    for one, other in itertools.combinations(range(scene.views), 2):
+        between = poses.camera_from_camera1[other] @ invert_rigid(poses.camera_from_camera1[one])
+        deg, mm = math.degrees(float(rotation_angle(between[:3, :3]))), float(between[:3, 3].norm())
+        if deg < _ONE_PLACE_DEG and mm < _ONE_PLACE_MM:
+            told.append(
+                f"views {one + 1} and {other + 1} were taken from one place ({deg:.1f}°, {mm:.0f} mm apart): they tell "
+                "depth as one of them does. Is it the same view twice?"
+            )
+    return tuple(told)
 
 
 def notes_on_the_carm(carm: CArm, poses: Poses) -> tuple[str, ...]:

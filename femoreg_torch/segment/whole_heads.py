@@ -101,9 +101,8 @@ def whole_heads(
             for c, s, n in zip(centre, step, labels.shape, strict=True)
         )
         here, bright = labels[box], hu[box]
-        apart = (
-            np.stack(np.indices(here.shape), -1) * step + [s.start * d for s, d in zip(box, step, strict=True)] - centre
-        )
+        first = np.array([part.start for part in box])
+        apart = (_voxels(here.shape) + first) * step - centre
         beyond = np.linalg.norm(apart, axis=-1) - head.reach(apart)
         ball = beyond < 0
         if (here[ball] == femur).mean() < _LEAST_FEMUR or (bright[ball] > _METAL_HU).mean() > _MOST_METAL:
@@ -180,11 +179,16 @@ def _voted_spheres(around: _Around) -> list[Points]:
     """Centres and radii (4,) that most sheets vote for, near the middle of what is looked at."""
     coarse = ndimage.zoom(around.hu, 1 / COARSE_MM, order=1, mode="nearest", grid_mode=True)
     votes, radii = sphere_votes(coarse)
-    places = (np.stack(np.indices(votes.shape), -1) + 0.5) * COARSE_MM - 0.5
+    places = (_voxels(votes.shape) + 0.5) * COARSE_MM - 0.5
     near = np.linalg.norm(places - np.array(around.hu.shape) / 2, axis=-1) < _FROM_MIDDLE_MM
     peaks = np.argwhere(near & (votes == ndimage.maximum_filter(votes, _PEAK_VOXELS)))
     peaks = peaks[np.argsort(-votes[tuple(peaks.T)])][:_CANDIDATES]
     return [np.r_[places[tuple(peak)], float(radii[tuple(peak)])] for peak in peaks]
+
+
+def _voxels(shape: tuple[int, ...]) -> Points:
+    """The indices (Z, Y, X, 3) of all voxels."""
+    return np.moveaxis(np.indices(shape).astype(float), 0, -1)
 
 
 def _sheets(smooth: NDArray[np.float32], sphere: Points, within: float, ways: Points) -> tuple[Points, Mask]:

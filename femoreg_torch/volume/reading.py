@@ -135,7 +135,8 @@ def _label_map_told(path: Path, ids: Collection[int] | None) -> tuple[Volume, tu
     if not (data.min() >= 0 and data.max() <= LARGEST_ID and whole):
         raise InputError(
             f"{path}: a label map of whole numbers from 0 to {LARGEST_ID} was expected, found {data.min():g} to "
-            f"{data.max():g}. Export the segmentation as a label map."
+            f"{data.max():g}{'' if whole else ', and fractions between them'}. Export the segmentation as a label map"
+            f"{'' if whole else ', and resample it by nearest neighbour'}."
         )
     labels = data.astype(np.uint8 if data.max() <= 255 else np.int32)
     return Volume(torch.from_numpy(labels), _lps_from_index(image)), told

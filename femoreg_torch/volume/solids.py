@@ -40,9 +40,13 @@ def solid_volumes(solids: Sequence[Solid], spacing_mm: float) -> tuple[Volume, .
     """
     grid = empty_grid(_bounds(solids), spacing_mm)
     free = torch.ones_like(grid.data)
-    volumes = []
+    volumes: list[Volume] = []
+    shares: list[Tensor] = []
     for solid in reversed(solids):
         share = _share(solid.shape, grid)
+        if any(torch.equal(share, later) for later in shares):
+            raise InputError(f"{solid.name}: a later part has the same shape at the same place. Name each part once.")
+        shares.append(share)
         kept = torch.minimum(share, free)
         if kept.sum() <= _LEAST_LEFT * share.sum():
             raise InputError(f"{solid.name}: later parts fill all of its space and replace it. Name it after them.")

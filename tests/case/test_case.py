@@ -44,7 +44,7 @@ def example(folder: Path) -> Case:
         labels_path=folder / "labels.nii.gz",
         bones=label_table("totalsegmentator_v2"),
         landmarks=landmarks,
-        plan=planned("left", points[14], landmarks["FH-l"], device),
+        plan=planned(points[14], landmarks["FH-l"], device),
         truth=poses_by_object(torch.stack([pose(2), pose(3)]), "pelvis", {"femur": pose(4), "device": pose(5)}),
         template="femoroplasty",
         side="left",

@@ -83,7 +83,7 @@ def make_procedure(tmp_path: Path) -> tuple[Path, Path]:
         labels_path=folder / "labels.nii.gz",
         bones={"pelvis": (1,), "femur_left": (5,)},
         landmarks={"FH-l": head},
-        plan=planned("left", head + torch.tensor([10.0, 0, -20], dtype=torch.float64), head, device),
+        plan=planned(head + torch.tensor([10.0, 0, -20], dtype=torch.float64), head, device),
         truth=truth,
         template="femoroplasty",
         side="left",

@@ -1,6 +1,7 @@
 """Tables, overlay and report of a run, on a small case made here."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -152,6 +153,10 @@ def test_a_case_whose_plan_was_changed_since_is_refused(
     assert main(["evaluate", str(folder), str(run)]) == 2
     assert "its entry point is another one than the result tells" in capsys.readouterr().err
     assert not (run / "report.html").exists()
+    change_result(run, lambda c: c.update(case=os.path.relpath(folder, run)))
+    assert main(["navigate", str(run)]) == 2
+    assert "its entry point is another one than the result tells" in capsys.readouterr().err
+    assert not (run / "navigation.json").exists()
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from registration_scenes import CARM, REFERENCE_POINTS, float64, make_scene, off
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
-from femoreg_torch.geometry import CameraChange, Poses, Uncertainty, rigid
+from femoreg_torch.geometry import CameraChange, Poses, Uncertainty, about_point, exp_se3, rigid
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic
 from femoreg_torch.registration.covariance import pose_covariance
 from femoreg_torch.registration.doubts import doubts_about_the_carm
@@ -17,7 +17,7 @@ from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, doubted, dou
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, image_quadratic, stage_objective
 from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance
-from femoreg_torch.registration.run import notes_on_the_carm
+from femoreg_torch.registration.run import notes_on_the_carm, notes_on_the_views
 from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, moved, reference_point_in_view
 from femoreg_torch.registration.stage import BodyPlan, Stage, run_stage
 from femoreg_torch.similarity import GradNcc
@@ -347,3 +347,16 @@ def test_what_is_not_drawn_does_not_slide(scene: Scene) -> None:
     after = moved(true_poses(), (refined,), float64(1.0, *[0.0] * 6))
     assert torch.equal(after.camera1_from["device"], true_poses().camera1_from["device"])
     assert not torch.equal(after.camera1_from["femur"], true_poses().camera1_from["femur"])
+
+
+def test_one_view_and_views_from_one_place_are_noted(scene: Scene) -> None:
+    assert notes_on_the_views(scene, true_poses()) == ()
+    alone = replace(scene, images={kind: (images[0],) for kind, images in scene.images.items()})
+    one = notes_on_the_views(alone, true_poses().first_views(1))
+    assert len(one) == len(scene.objects)
+    assert all(note.startswith("one view alone shows ") for note in one)
+    poses = true_poses()
+    near = about_point(exp_se3(float64(0, 0.02, 0, 0, 0, 0)[None]), float64(0, 0, 600))[0]
+    twice = poses.with_view(2, near @ poses.camera_from_camera1[1])
+    (note,) = notes_on_the_views(scene, twice)
+    assert note.startswith("views 2 and 3 were taken from one place (1.1°, 12 mm apart)")

@@ -74,6 +74,14 @@ def test_images_of_something_else(scene: Scene) -> None:
         assert says in doubts_about_the_images(with_image(scene, kind, 1, noise), TRUTH, PLAIN)[0]
 
 
+def test_poses_that_the_case_gives_are_named_where_an_image_does_not_fit(scene: Scene) -> None:
+    noise = torch.rand(scene.image("anatomy", 1).shape, generator=torch.Generator().manual_seed(3))
+    given = replace(with_image(scene, "anatomy", 1, noise), camera_from_camera1=TRUTH.camera_from_camera1)
+    told = doubts_about_the_images(given, TRUTH, PLAIN)[0]
+    assert "does not fit at the pose that the case gives" in told
+    assert "not the inverse" in told
+
+
 def test_the_only_device_image_may_be_of_something_else() -> None:
     """There is no other view that it could have been taken in."""
     truth = true_poses((0,))

@@ -67,7 +67,7 @@ def drawn_case(tmp_path_factory: pytest.TempPathFactory) -> Path:
         labels_path=folder / "labels.nii.gz",
         bones={"pelvis": (1,), "femur_left": (5,)},
         landmarks=places,
-        plan=planned("left", head + torch.tensor([10.0, 0, -20], dtype=torch.float64), head, None),
+        plan=planned(head + torch.tensor([10.0, 0, -20], dtype=torch.float64), head, None),
         template="femoroplasty",
         side="left",
     )

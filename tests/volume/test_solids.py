@@ -79,6 +79,13 @@ def test_a_solid_within_later_ones_is_named() -> None:
     solid_volumes([Solid(OUTER, 900, "handle.stl"), Solid(inside, 9000, "pin.stl")], 0.5)
 
 
+def test_a_part_that_is_given_twice_is_named() -> None:
+    """Half-filled voxels of its rim would be left of the first one."""
+    thin = trimesh.creation.box((1.3, 1.3, 9.1))
+    with pytest.raises(InputError, match=r"pin\.stl: a later part has the same shape at the same place"):
+        solid_volumes([Solid(thin, 9000, "pin.stl"), Solid(thin.copy(), 900, "again.stl")], 0.5)
+
+
 def test_parts_in_metres_are_refused() -> None:
     small = [Solid(mesh.copy().apply_scale(0.001), 900, "handle.stl") for mesh in (OUTER, INNER)]
     with pytest.raises(InputError, match=r"handle\.stl: its longest edge is 0\.0507 mm"):

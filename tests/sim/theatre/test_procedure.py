@@ -63,7 +63,7 @@ def known(mesh, settings):
         objects=femoroplasty_objects("left", HEAD, device),
         anatomy=HIP,
         landmarks=dict.fromkeys(HIP.landmark_names, HEAD),
-        plan=planned("left", entry, HEAD, device),
+        plan=planned(entry, HEAD, device),
         side="left",
     )
     return Preoperative(case, "left", HEAD, (FEMUR_ID,), Path("ct.nii.gz"), Path("labels.nii.gz"), device)
