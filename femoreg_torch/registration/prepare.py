@@ -153,7 +153,7 @@ def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]
     if wrong := [*told, *filter(None, [seen.unscaled])]:
         raise InputError(f"{case.folder}: {'; '.join(wrong)}.")
     elsewhere = seen.light or seen.elsewhere or soft_bones(ct, bones.labels, bones.ids)
-    return (*filter(None, [elsewhere]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
+    return (*filter(None, [elsewhere, seen.windowed]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
 
 
 def _told_of_files(case: Case, ct: Volume, bones: BoneLabels) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -22,6 +22,7 @@ _LEAST_BONE_HU, _LEAST_CORTEX_HU, _MOST_SOFT_HU = -150.0, 350.0, 350.0
 # to 379; with marrow of fat 0.39 to 0.83, by −3 on; of sacrum or femora alone 0.24 to 0.34, by −56 on. Of the same CTs
 # turned by 180° or flipped head to foot or front to back 0.03 to 0.19 were, by −772 to 29.
 _LEAST_DENSER, _LEAST_RISE_HU = 0.2, 40.0
+_LEAST_CUT_OFF_HU, _MOST_CUT_OFF = 700.0, 0.05  # cortex has more; of measured bone hardly two voxels have just the most
 _LEAST_VOXELS = 50  # of a bone, and beside it
 _MOST_VALUES = 20_000  # a quantile needs no more
 _REACH_MM = 18.0  # how far a label map is looked for: a best place beyond the farthest shift that is told is none
@@ -41,6 +42,8 @@ class Densities:
     cortex: float  # of the densest twentieth, the least
     beside: float  # median of what lies some voxels beside the bones
     denser: float  # share of the bones' voxels that are denser than 19 of 20 beside them
+    most: float  # in any bone
+    at_most: float  # share of the bones' voxels that have just that
 
     @property
     def unscaled(self) -> str | None:
@@ -63,6 +66,16 @@ class Densities:
         )
 
     @property
+    def windowed(self) -> str | None:
+        """In words, that the densest bone was cut off, as by a window of a display; None where it was not."""
+        if not (self.most < _LEAST_CUT_OFF_HU and self.at_most > _MOST_CUT_OFF):
+            return None
+        return (
+            f"CT: no bone has more than {self.most:.0f} HU, and {self.at_most:.0%} of their voxels have just that. "
+            "It seems to be saved with a window of a display, so that cortex is lost: export it in HU"
+        )
+
+    @property
     def elsewhere(self) -> str | None:
         """In words, that a label map's bones are hardly denser than what lies beside them; None where they are."""
         if not (self.denser < _LEAST_DENSER and self.bone - self.beside < _LEAST_RISE_HU):
@@ -81,7 +94,9 @@ def densities(ct: Volume, labels: Volume) -> Densities:
     near, far = (_grown(inside, by) for by in (1, 3))
     bone, beside = data[inside], data[far & ~near]
     denser = float((bone > _quantile(beside, 0.95)).float().mean())
-    return Densities(_quantile(bone, 0.5), _quantile(bone, 0.95), _quantile(beside, 0.5), denser)
+    most = float(bone.max())
+    at_most = float((bone == most).float().mean())
+    return Densities(_quantile(bone, 0.5), _quantile(bone, 0.95), _quantile(beside, 0.5), denser, most, at_most)
 
 
 def soft_bones(ct: Volume, labels: Volume, ids: Mapping[str, int]) -> str | None:

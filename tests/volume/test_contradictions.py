@@ -80,6 +80,14 @@ def test_an_intercept_that_is_missing_or_there_twice_is_told() -> None:
     assert twice.unscaled is None
 
 
+def test_a_ct_that_was_saved_with_a_window_is_told() -> None:
+    ct, labels = ct_and_labels()
+    assert densities(ct, labels).windowed is None
+    cut = ct.with_data(ct.data.clamp(-160, 240))
+    assert "no bone has more than 240 HU" in str(densities(cut, labels).windowed)
+    assert densities(ct.with_data(ct.data.clamp_max(1500)), labels).windowed is None
+
+
 def test_a_ct_without_bright_bone_tells_nothing_of_its_labels_place() -> None:
     ct, labels = ct_and_labels()
     assert misplaced_labels(ct.with_data(ct.data.clamp_max(100)), labels, IDS) is None
