@@ -40,11 +40,11 @@ def views_exchanged(images: Mapping[str, Tensor], first_kind: str) -> list[str]:
 
 
 def kinds_exchanged(attenuations: Mapping[str, Tensor | None], without: str, with_it: str) -> list[str]:
-    """In words, in which views the image `with_it`, the device, shows less than that `without` it, if in most.
+    """In words, in which views the image `with_it`, the device, shows less than that `without` it.
 
     `attenuations` (H, W), up to a scale, are named `views[0].anatomy` and so on.
     """
-    exchanged, right = [], 0
+    exchanged = []
     for key, alone in attenuations.items():
         view, _, kind = key.rpartition(".")
         both = attenuations.get(f"{view}.{with_it}") if kind == without else None
@@ -52,8 +52,7 @@ def kinds_exchanged(attenuations: Mapping[str, Tensor | None], without: str, wit
             continue
         more, less = _differing(alone, both)
         exchanged += [view] if less > _LEAST_SHARE and more < _MOST_OTHER * less else []
-        right += more > _LEAST_SHARE and less < _MOST_OTHER * more
-    if len(exchanged) <= right:
+    if not exchanged:
         return []
     return [
         f"{', '.join(exchanged)}: `{without}` shows something dense that `{with_it}` lacks, not the other way round: "

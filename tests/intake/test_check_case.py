@@ -452,8 +452,8 @@ def test_images_with_and_without_the_device_that_are_exchanged_are_told(
     folder = tmp_path / "case"
     shutil.copytree(files, folder)
 
-    def told(names: tuple[str, str], moved: bool = False) -> list[str]:
-        for view in (1, 2, 3):
+    def told(names: tuple[str, str], moved: bool = False, views: tuple[int, ...] = (1, 2, 3)) -> list[str]:
+        for view in views:
             lumps = cv2.GaussianBlur(np.random.default_rng(view).normal(size=(48, 40)), (0, 0), 2)
             attenuation = 1.2 + lumps / lumps.std() / 3
             both = attenuation + 0.8 * (np.arange(40) // 3 == 5)
@@ -470,6 +470,9 @@ def test_images_with_and_without_the_device_that_are_exchanged_are_told(
     assert told(("", "_device"), moved=True) == []
     (line,) = told(("_device", ""))
     assert line.startswith("views[0], views[1], views[2]: `anatomy` shows something dense that `device` lacks")
+    told(("", "_device"))
+    (line,) = told(("_device", ""), views=(2,))
+    assert line.startswith("views[1]: `anatomy` shows something dense that `device` lacks")
 
 
 def test_few_landmarks_are_a_warning(files: Path, tmp_path: Path) -> None:
