@@ -29,7 +29,7 @@ from femoreg_torch.geometry import Camera, Poses, about_point, exp_se3, transfor
 from femoreg_torch.optimize import levenberg
 from femoreg_torch.registration import Scene, Stage, load_plan, prepare_scene
 from femoreg_torch.registration.compared import prepared
-from femoreg_torch.registration.imaging import tissue_integrals
+from femoreg_torch.registration.imaging import draw, draw_still, tissue_integrals
 from femoreg_torch.registration.level import Level, binning
 from femoreg_torch.registration.objective import ImageCosts, image_costs
 from femoreg_torch.registration.scene import Body
@@ -213,6 +213,14 @@ def _of_the_objective(scene: Scene, poses: Poses) -> Iterator[Lever]:
             lambda: project([tissue], pose[None, None], camera, 3.0)[0],
             lambda: tissue_integrals(tissue, pose, camera),
         )
+
+    finest, pelvis, where = Level(pixel_mm=0.39, step_mm=0.5), scene.objects["pelvis"], poses.camera_from("pelvis")[0]
+    yield Lever(
+        "what stands still is drawn on pixels that fit its voxels, and interpolated",
+        "the pelvis, 768²",
+        lambda: draw([pelvis], where[None, None], finest.camera(scene.carm.camera), finest.step_mm)[0],
+        lambda: draw_still(pelvis, where, finest.camera(scene.carm.camera), finest.step_mm),
+    )
 
 
 def _of_the_similarity(scene: Scene, poses: Poses) -> Iterator[Lever]:
