@@ -22,7 +22,11 @@ _LEAST_BONE_HU, _LEAST_CORTEX_HU, _MOST_SOFT_HU = -150.0, 350.0, 350.0
 # to 379; with marrow of fat 0.39 to 0.83, by −3 on; of sacrum or femora alone 0.24 to 0.34, by −56 on. Of the same CTs
 # turned by 180° or flipped head to foot or front to back 0.03 to 0.19 were, by −772 to 29.
 _LEAST_DENSER, _LEAST_RISE_HU = 0.2, 40.0
-_LEAST_CUT_OFF_HU, _MOST_CUT_OFF = 700.0, 0.05  # cortex has more; of measured bone hardly two voxels have just the most
+_LEAST_CUT_OFF_HU, _MOST_CUT_OFF, _AIR_HU = (
+    700.0,
+    0.05,
+    -900.0,
+)  # cortex has more; of measured bone hardly two voxels have just the most
 _LEAST_VOXELS = 50  # of a bone, and beside it
 _MOST_VALUES = 20_000  # a quantile needs no more
 _REACH_MM = 18.0  # how far a label map is looked for: a best place beyond the farthest shift that is told is none
@@ -44,6 +48,7 @@ class Densities:
     denser: float  # share of the bones' voxels that are denser than 19 of 20 beside them
     most: float  # in any bone
     at_most: float  # share of the bones' voxels that have just that
+    least: float  # anywhere
 
     @property
     def unscaled(self) -> str | None:
@@ -67,8 +72,8 @@ class Densities:
 
     @property
     def windowed(self) -> str | None:
-        """In words, that the densest bone was cut off, as by a window of a display; None where it was not."""
-        if not (self.most < _LEAST_CUT_OFF_HU and self.at_most > _MOST_CUT_OFF):
+        """In words, that densest bone and air were cut off, as by a window of a display; None where they were not."""
+        if not (self.most < _LEAST_CUT_OFF_HU and self.at_most > _MOST_CUT_OFF and self.least > _AIR_HU):
             return None
         return (
             f"CT: no bone has more than {self.most:.0f} HU, and {self.at_most:.0%} of their voxels have just that. "
@@ -96,7 +101,8 @@ def densities(ct: Volume, labels: Volume) -> Densities:
     denser = float((bone > _quantile(beside, 0.95)).float().mean())
     most = float(bone.max())
     at_most = float((bone == most).float().mean())
-    return Densities(_quantile(bone, 0.5), _quantile(bone, 0.95), _quantile(beside, 0.5), denser, most, at_most)
+    least = float(data.min())
+    return Densities(_quantile(bone, 0.5), _quantile(bone, 0.95), _quantile(beside, 0.5), denser, most, at_most, least)
 
 
 def soft_bones(ct: Volume, labels: Volume, ids: Mapping[str, int]) -> str | None:

@@ -86,6 +86,8 @@ def test_a_ct_that_was_saved_with_a_window_is_told() -> None:
     cut = ct.with_data(ct.data.clamp(-160, 240))
     assert "no bone has more than 240 HU" in str(densities(cut, labels).windowed)
     assert densities(ct.with_data(ct.data.clamp_max(1500)), labels).windowed is None
+    of_one_density = ct.with_data(torch.where(labels.data > 0, 600.0, ct.data))
+    assert densities(of_one_density, labels).windowed is None
 
 
 def test_a_ct_without_bright_bone_tells_nothing_of_its_labels_place() -> None:
