@@ -37,7 +37,7 @@ def navigate(run: Path, *, robot: Path | None = None) -> None:
     )
 
     result = read_result(run)
-    _check_plan(run, result)
+    not_asked = _check_plan(run, result)
     tool = (result.path and result.path[1]) or "device"
     calibration = None if robot is None else read_robot(robot, tool)
     try:
@@ -47,16 +47,27 @@ def navigate(run: Path, *, robot: Path | None = None) -> None:
     with new_folder(run, without=NAVIGATION_NAMES) as folder:
         write_navigation(folder, content)
     console = Console()
+    if not_asked is not None:
+        console.print(f"Whether the plan was changed since was not asked: {not_asked}", markup=False)
     for line in summary(content):
         console.print(line)
     console.print(f"Written to {run / NAVIGATION_NAME} and {run / 'navigation'}")
 
 
-def _check_plan(run: Path, result: "Result") -> None:
-    """Raises `InputError` if the case that was registered, where it still stands there, has another plan by now."""
+def _check_plan(run: Path, result: "Result") -> str | None:
+    """Raises `InputError` if the case that was registered, where it still stands there, has another plan by now.
+
+    Returns why that was not asked, if it was not: a run is complete without its case, whose CT, say, may be archived.
+    """
     from femoreg_torch.case import read_case
-    from femoreg_torch.case.reading import CASE_NAME
+    from femoreg_torch.errors import InputError
     from femoreg_torch.evaluation.fit import check_plan_fits
 
-    if result.case is not None and (run / result.case / CASE_NAME).is_file():
-        check_plan_fits(read_case(run / result.case), result)
+    if result.case is None:
+        return "the result names no case."
+    try:
+        case = read_case(run / result.case)
+    except InputError as error:
+        return str(error)
+    check_plan_fits(case, result)
+    return None

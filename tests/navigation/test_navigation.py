@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from femoreg_torch.case import Result
 from femoreg_torch.commands.main import main
-from femoreg_torch.files import write_json
+from femoreg_torch.files import read_json, write_json
 from femoreg_torch.geometry import poses_by_object
 from femoreg_torch.navigation import navigation_content, read_robot
 
@@ -81,6 +81,18 @@ flange_from_device
         encoding="utf-8",
     )
     return path
+
+
+def test_a_run_whose_case_is_gone_is_told_that_its_plan_was_not_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_run(tmp_path / "run")
+    write_json(run / "result.json", read_json(run / "result.json") | {"case": "../archived"})
+    assert main(["navigate", str(run)]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "Whether the plan was changed since was not asked:" in told
+    assert "archived" in told
+    assert (run / "navigation.json").is_file()
 
 
 def test_what_is_written_fits_its_schema(tmp_path: Path, against_schema: Callable[[str, Any], list[str]]) -> None:
