@@ -4,7 +4,7 @@ import ctypes
 import os
 from contextlib import suppress
 
-_NEVER = 2**30  # bytes: what lies at the end of the heap is given back beyond so many, and larger arrays lie beside it
+_NEVER = 2**30  # bytes: less is not given back from the end of the heap, and smaller arrays do not lie outside it
 # Settings of glibc's malloc: the variable that a process reads when it starts, mallopt's number (malloc.h), the value.
 # One arena: what one thread frees, the next one takes.
 _SETTINGS = (
