@@ -99,8 +99,8 @@ def hardly_shown(scene: Scene, poses: Poses, names: Sequence[str]) -> tuple[str,
         share = float(_in_picture(project_points(scene.carm.camera, points), scene.carm.camera).double().mean())
         if share == 0:
             found.append(
-                f"{name}: where it is meant to stand, nothing of it lies in the picture of view 1. Its start pose is "
-                "to lead from its space to camera 1: is it the inverse?"
+                f"{name}: where it is meant to stand, nothing of it lies in the picture of view 1. The start pose "
+                "must take points of its space to camera 1: is this the inverse?"
             )
         elif share < _LEAST_SHOWN:
             found.append(

@@ -21,12 +21,11 @@ from torch.nn import functional as F
 from femoreg_torch.anatomy import Anatomy
 from femoreg_torch.segment.boxes import Mask, radius
 from femoreg_torch.segment.crest import sides_of_the_crest
-from femoreg_torch.segment.whole_heads import whole_heads
+from femoreg_torch.segment.whole_heads import METAL_HU, SOFT_HU, whole_heads
 from femoreg_torch.volume import Volume
 
 _FINEST_MM = 1.0  # finer voxels are averaged; labels then lie within half a millimetre
 _MARGIN_MM = 9.0  # around what the network labels
-_SOFT_HU = 50.0
 # Of the way from soft tissue to the brightest bone within `_NEAR_MM`, and bounds in HU. Above the first, thin and
 # blurred cortex still hangs together, so that marrow is enclosed. At half the way lies the edge of a plate that is wide
 # beside the scanner's blur; voxels that are reached from outside are asked for that.
@@ -43,7 +42,7 @@ _SOFTNESS_HU = 100.0  # about the threshold, over which the CT's evidence goes f
 _CT_WEIGHT = 0.35  # of the CT's evidence beside the network's share: 0.15 to 0.85 is the band where the CT decides
 _JOINT_WEIGHT = 2.0  # where hip bone and femur are equally likely lies the joint space, and the CT decides
 _JOINT_SHARE = 0.05  # of either bone: where the joint has settled the edge
-_METAL_HU, _METAL_MM = 2300.0, 3.0  # in metal and so far around it the network decides alone
+_METAL_MM = 3.0  # in metal and so far around it the network decides alone
 _CLOSE_MM = 2.0  # gaps so wide within a bone are marrow, where the network agrees
 _CLOSED_SHARE = 0.4
 _SURE_MM = 3.0  # a voxel so far from the other bone is surely of its own
@@ -174,7 +173,7 @@ def _linear(values: Tensor, places: Tensor, axis: int) -> Tensor:
 
 def _threshold(brightest: Tensor, share: float, lowest: float, highest: float) -> Tensor:
     """HU above which a voxel is bone, from the brightest bone near it."""
-    return (_SOFT_HU + share * (brightest - _SOFT_HU)).clamp(lowest, highest)
+    return (SOFT_HU + share * (brightest - SOFT_HU)).clamp(lowest, highest)
 
 
 def _is_bone(bone: Tensor, region: _Region, threshold: Tensor) -> Tensor:
@@ -185,7 +184,7 @@ def _is_bone(bone: Tensor, region: _Region, threshold: Tensor) -> Tensor:
 
 
 def _near_metal(region: _Region) -> Tensor:
-    metal = region.hu > _METAL_HU
+    metal = region.hu > METAL_HU
     return _largest_near(metal.float(), radius(_METAL_MM, region.spacing)) > 0 if bool(metal.any()) else metal
 
 

@@ -27,6 +27,7 @@ from femoreg_torch.segment.sphere_votes import (
     sphere_votes,
 )
 
+SOFT_HU, METAL_HU = 50.0, 2300.0  # of soft tissue, and from which on something is metal
 _AT_JOINT_MM = 15.0  # of the hip bone: femur that is nearer is head, and some of the neck
 _LEAST_ML = 2.0  # of it
 _AROUND_MM = 45.0  # to either side of its middle, where the sphere is looked for
@@ -46,25 +47,25 @@ _MOST_A_ROUND_MM = 8.0  # that the centre moves; else it runs away
 # screw within: 0.66 to 0.72; on other spheres near them 0.58 at most. On six of simulated CTs: 0.98 to 1.00.
 _LEAST_SEEN = 0.6
 _LEAST_FEMUR = 0.4  # of the ball, by the labels: 0.55 to 0.63 on those four
-_MOST_METAL, _METAL_HU = 0.25, 2300.0  # of the ball; a prosthesis has a head of its own
+_MOST_METAL = 0.25  # of the ball; a prosthesis has a head of its own
 _BESIDE = 0.4  # rays whose ends on the unit sphere are so near (23°): the cortex is taken at their median
 _CORTEX_MM = 0.5  # from the middle of the cortex to its outside
 _JOINT_MM = 3.0  # the socket is farther, but for its cortex; that is brighter than half of the brightest so near
-_SOFT_HU = 50.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Around:
-    """What lies around the head of a femur, on cubic voxels of 1 mm."""
+    """What lies around the head of a femur, on voxels of 1 mm (within one per cent, as whole ones fill a box)."""
 
     hu: NDArray[np.float32]  # (Z, Y, X)
     femur: NDArray[np.float32]
     hip: NDArray[np.float32]
     first: NDArray[np.intp]  # z, y, x of the first voxel, in the region's
+    size_mm: Points  # (3,) of its voxels
 
     def place(self, point: Points, step: Points) -> Points:
         """The place in mm from the middle of the region's first voxel, z, y, x, of a point (3,) in voxels."""
-        return self.first * step + point + (1 - step) / 2
+        return (self.first - 0.5) * step + (point + 0.5) * self.size_mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +106,9 @@ def whole_heads(
         apart = (_voxels(here.shape) + first) * step - centre
         beyond = np.linalg.norm(apart, axis=-1) - head.reach(apart)
         ball = beyond < 0
-        if (here[ball] == femur).mean() < _LEAST_FEMUR or (bright[ball] > _METAL_HU).mean() > _MOST_METAL:
+        if (here[ball] == femur).mean() < _LEAST_FEMUR or (bright[ball] > METAL_HU).mean() > _MOST_METAL:
             continue
-        half = (ndimage.maximum_filter(bright.clip(max=_METAL_HU), width(_JOINT_MM, spacing)) + _SOFT_HU) / 2
+        half = (ndimage.maximum_filter(bright.clip(max=METAL_HU), width(_JOINT_MM, spacing)) + SOFT_HU) / 2
         result[box][(here == hip) & (beyond < _JOINT_MM) & (bright < half)] = 0
         result[box][ball & ((here == 0) | (here == hip))] = femur
     return result
@@ -133,7 +134,8 @@ def _around_the_head(femur: Mask, hip: Mask, hu: NDArray[np.float32], step: Poin
         )
         return found
 
-    return _Around(cubic(hu).clip(*RIDGE_RANGE_HU), cubic(femur), cubic(hip), first)
+    near_hu = cubic(hu).clip(*RIDGE_RANGE_HU)
+    return _Around(near_hu, cubic(femur), cubic(hip), first, (last - first) * step / near_hu.shape)
 
 
 def _head_of(around: _Around) -> _Head | None:

@@ -22,11 +22,8 @@ _LEAST_BONE_HU, _LEAST_CORTEX_HU, _MOST_SOFT_HU = -150.0, 350.0, 350.0
 # to 379; with marrow of fat 0.39 to 0.83, by −3 on; of sacrum or femora alone 0.24 to 0.34, by −56 on. Of the same CTs
 # turned by 180° or flipped head to foot or front to back 0.03 to 0.19 were, by −772 to 29.
 _LEAST_DENSER, _LEAST_RISE_HU = 0.2, 40.0
-_LEAST_CUT_OFF_HU, _MOST_CUT_OFF, _AIR_HU = (
-    700.0,
-    0.05,
-    -900.0,
-)  # cortex has more; of measured bone hardly two voxels have just the most
+# Cortex has more HU, and air is darker; of measured bone hardly two voxels have just the most.
+_LEAST_CUT_OFF_HU, _MOST_CUT_OFF, _AIR_HU = 700.0, 0.05, -900.0
 _LEAST_VOXELS = 50  # of a bone, and beside it
 _MOST_VALUES = 20_000  # a quantile needs no more
 _REACH_MM = 18.0  # how far a label map is looked for: a best place beyond the farthest shift that is told is none
