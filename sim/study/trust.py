@@ -5,7 +5,7 @@ the capture range or beyond it, or the device beyond what its search covers.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,7 @@ import torch
 
 from femoreg_torch.case import Case, read_case
 from femoreg_torch.case.femoroplasty import DEVICE, PELVIS
-from femoreg_torch.case.model import Start
-from femoreg_torch.case.verdict import verdict_on
-from femoreg_torch.evaluation import ReferencePoints, errors, reference_points
-from femoreg_torch.files import plain
-from femoreg_torch.registration import Plan, prepare_scene, run_plan
-from femoreg_torch.registration.quality import Limits, assess
+from femoreg_torch.registration import Plan, prepare_scene
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.statistics.formats import pipe_table
 from femoreg_torch.statistics.outcome import WRONG_DEG, WRONG_MM
@@ -35,7 +30,7 @@ from sim.study.record import Record
 from sim.study.starts import Offset, displaced
 from sim.study.store import Run
 from sim.study.study import Study
-from sim.study.trial import kind
+from sim.study.trial import kind, register_case
 from sim.study.work import Setting
 
 _NONE = Offset(0, 0, 0)
@@ -72,34 +67,19 @@ class Sabotaged:
         body = body_of(procedure, self.stores, self.imaged, scratch)
         folder = made_once(setting.variation, procedure, setting.simulation, body, self.imaged)
         case = read_case(folder)
-        scene, points = prepare_scene(case), reference_points(case)
-        return lambda run: _sabotaged(case, scene, points, setting.plan, dict(run.varied))
+        scene = prepare_scene(case)
+        return lambda run: _sabotaged(case, scene, setting.plan, dict(run.varied))
 
 
-def _sabotaged(case: Case, scene: Scene, points: ReferencePoints, plan: Plan, varied: dict[str, Any]) -> Record:
+def _sabotaged(case: Case, scene: Scene, plan: Plan, varied: dict[str, Any]) -> Record:
     assert case.truth is not None  # of a simulated case
-    place, start = _NAMES.index(varied["sabotage"]), varied["start"]
-    generator = torch.Generator().manual_seed(1000 * place + start)
-    true = case.truth.camera1_from
-    pelvis, device = (
-        displaced(true[name], scene.objects[name].reference_point, by, generator)
+    place, seed = _NAMES.index(varied["sabotage"]), varied["start"]
+    generator = torch.Generator().manual_seed(1000 * place + seed)
+    start = {
+        name: displaced(case.truth.camera1_from[name], scene.objects[name].reference_point, by, generator)
         for name, by in ((PELVIS, SABOTAGES[place].pelvis), (DEVICE, SABOTAGES[place].device))
-    )
-    objects = {**scene.objects, DEVICE: replace(scene.objects[DEVICE], start=Start(camera1_from=device))}
-    wrong = replace(scene, objects=objects)
-    outcome = run_plan(wrong, plan, pelvis, start, lambda *_: None)
-    quality = assess(wrong, outcome.poses, Limits(), plan.imaging, outcome.trace)
-    verdict = verdict_on(tuple(outcome.poses.camera1_from), quality)
-    record = {
-        "refused": None,
-        "trusted": verdict.trusted,
-        "reasons": list(verdict.reasons),
-        "asked": list(true),
-        "errors": errors(case.truth, outcome.poses, points),
-        "quality": {name: asdict(value) for name, value in quality.items()},
     }
-    found: Record = plain(record)
-    return found
+    return register_case(case, plan, seed, start=start, scene=scene)[0]
 
 
 def plan_trust(setting: Setting, chosen: Sequence[Procedure], stores: Stores, imaged: Imaged, starts: int) -> Study:

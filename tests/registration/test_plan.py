@@ -1,5 +1,6 @@
 """Presets as data: those that ship, and what a mistake in one says."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -84,6 +85,19 @@ def test_the_paper_preset_is_the_papers() -> None:
     assert plan.steps.index(materials) == len(plan.steps) - 2
     assert all(isinstance(stage.optimiser, Bobyqa) for stage in plan.stages if len(stage.bodies) > 1)
     assert all(isinstance(stage.optimiser, CmaEs) for stage in plan.stages if len(stage.bodies) == 1)
+
+
+def test_the_preset_of_a_carm_as_told_is_fast_without_refined_intrinsics() -> None:
+    fast, told = load_plan("fast").steps, load_plan("fast_carm_as_told").steps
+    assert [step.name for step in told] == [step.name for step in fast]
+    for one, other in zip(fast, told, strict=True):
+        if isinstance(one, Stage):
+            assert isinstance(other, Stage)
+            kept = [body for body in one.bodies if body.move != ["intrinsics"]]
+            assert other == replace(one, bodies=kept)
+        else:
+            assert other == one
+    assert not any("intrinsics" in body.move for step in told if isinstance(step, Stage) for body in step.bodies)
 
 
 def test_the_wide_preset_is_fast_with_two_more_searches_for_the_device() -> None:
