@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -51,6 +52,7 @@ from femoreg_torch.registration.models import (
     told_of_leaning,
     told_of_middle,
 )
+from femoreg_torch.registration.prepare import check_start
 from femoreg_torch.volume import NOBODY, is_in_ras, patient_of, read_ct_told, read_landmarks
 from femoreg_torch.volume.borders import cut_bones
 from femoreg_torch.volume.round_field import round_field
@@ -88,6 +90,8 @@ def check_case(folder: Path, find_start: bool = True, landmarks: Mapping[str, Te
     case = None
     if not found.problems:
         case = found.attempt(lambda: read_case(folder))
+    if case is not None:
+        _check_starts(case, found)
     if case is not None and not short:
         seen, images = _check_written_out(case, found)
     below = side_by_side(images)
@@ -99,6 +103,15 @@ def check_case(folder: Path, find_start: bool = True, landmarks: Mapping[str, Te
             below = start.picture
     picture = stacked(planes_of(seen, case), below)
     return Checked(tuple(alike_together(found.problems)), tuple(found.warnings), tuple(found.facts), picture)
+
+
+def _check_starts(case: Case, found: Found) -> None:
+    """Nominal poses of models that are not in the beam."""
+    for thing in case.objects.values():
+        point = thing.reference if thing.reference is not None else thing.points.get("tip")
+        if thing.model is not None and point is not None:
+            pose, where = thing.start.camera1_from, f"{case.folder}/case.yaml"
+            found.attempt(partial(check_start, thing.name, pose, point, case.carm.camera.sdd_mm, where))
 
 
 def _check_femoroplasty(top: Fields, folder: Path, found: Found) -> tuple[SeenAnatomy, dict[str, Tensor]]:

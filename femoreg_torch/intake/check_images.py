@@ -1,6 +1,7 @@
 """What is wrong with the views of a case and their images."""
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -47,6 +48,9 @@ from femoreg_torch.intake.exchanged import kinds_exchanged, rough_attenuation, v
 from femoreg_torch.intake.found import Found
 from femoreg_torch.volume import Patient
 
+# A detector of 200 to 430 mm, 900 to 1,300 mm from the source, is seen under 9 to 27°; one told in wrong units is not.
+_OPENING_DEG = 3.0, 45.0
+
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
@@ -84,6 +88,8 @@ def check_views(
         return {}
     if not views:
         found.problem(f"{top.where('views')}: empty. At least one fluoroscopic image is needed.")
+    if carm is not None:
+        found.warnings += _told_of_beam(carm.camera)
     read: dict[str, _Seen] = {}
     poses: dict[str, Tensor] = {}
     for number, view in enumerate(views):
@@ -120,6 +126,7 @@ def check_views(
 
 def check_images(case: Case, patient: Patient, found: Found) -> dict[str, Tensor]:
     """All images of a case whose CT is of that patient. Returns those (H, W) that could be read themselves, by key."""
+    found.warnings += _told_of_beam(case.carm.camera)
     read: dict[str, _Seen] = {}
     for number, view in enumerate(case.views):
         shown = View({}, view.intensity, frames=view.frames, display=case.display_of(number))
@@ -177,6 +184,18 @@ def _check_image(
         shown, camera = view.display, view.display.stored_camera(carm.camera)
         found.attempt(lambda: check_matches(stored.values, camera, f"{where}: it"))
         found.attempt(lambda: check_header(stored.tags, camera, shown, carm.uncertainty, f"{where}: {path.name}"))
+
+
+def _told_of_beam(camera: Camera) -> list[str]:
+    """A beam that opens as no C-arm's does, in words."""
+    wide_mm = max(extent * mm for extent, mm in zip(camera.shape, camera.pixel_mm, strict=True))
+    opens = math.degrees(2 * math.atan2(wide_mm / 2, camera.sdd_mm))
+    if _OPENING_DEG[0] <= opens <= _OPENING_DEG[1]:
+        return []
+    return [
+        f"the C-arm's file tells {camera.sdd_mm:.4g} mm from the source to a detector {wide_mm:.3g} mm wide: a beam of "
+        f"{opens:.2g}°, where C-arms have some 10 to 25°. Are source distance and pixel size in mm?"
+    ]
 
 
 def _check_field(field: Circle | Polygon | Path | None, camera: Camera, where: str) -> None:

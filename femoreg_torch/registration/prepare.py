@@ -198,17 +198,21 @@ def _check_points(case: Case, thing: CaseObject, volume: Volume) -> None:
 def check_starts(objects: Mapping[str, RigidObject], sdd_mm: float, where: str) -> None:
     """Raises `InputError` that starts with `where` for a nominal pose that is not between source and detector."""
     for name, thing in objects.items():
-        pose = thing.start.camera1_from
-        if pose is None:
-            continue
-        depth = (pose[:3, :3] @ thing.reference_point + pose[:3, 3])[2].item()
-        if not _NEAREST * sdd_mm < depth < sdd_mm:
-            place = "behind the source" if depth <= 0 else "at the source" if depth < sdd_mm else "behind the detector"
-            raise InputError(
-                f"{where}: the start pose puts {name} {place}, {depth:.3g} mm along the beam from the source (it has "
-                f"{sdd_mm:.0f} mm to the detector). Give the transform from its space to camera 1, in mm, and not its "
-                "inverse."
-            )
+        check_start(name, thing.start.camera1_from, thing.reference_point, sdd_mm, where)
+
+
+def check_start(name: str, camera1_from: Tensor | None, point: Tensor, sdd_mm: float, where: str) -> None:
+    """Raises `InputError` if a nominal pose (4, 4) puts a point (3,) of an object not between source and detector."""
+    if camera1_from is None:
+        return
+    depth = (camera1_from[:3, :3] @ point + camera1_from[:3, 3])[2].item()
+    if not _NEAREST * sdd_mm < depth < sdd_mm:
+        place = "behind the source" if depth <= 0 else "at the source" if depth < sdd_mm else "behind the detector"
+        raise InputError(
+            f"{where}: the start pose puts {name} {place}, {depth:.3g} mm along the beam from the source (it has "
+            f"{sdd_mm:.0f} mm to the detector). Give the transform from its space to camera 1, in mm, and not its "
+            "inverse."
+        )
 
 
 def read_bones(case: Case) -> tuple[Volume, BoneLabels]:

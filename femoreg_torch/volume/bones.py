@@ -19,6 +19,9 @@ from femoreg_torch.volume.labels import label_box, looked_up
 
 _OTHER_BONE_HU = 80.0  # mean above which a label that no table names is bone, and a bone's rim does not grow into it
 _NEAR_MM = 15.0  # along every axis: a landmark lies closer than this to its bone
+# From side to side, of two in one label: the middles of hip bones and femora of twenty adults lay 120 mm apart and more,
+# those of the halves of one bone at most 50.
+_SIDES_APART_MM, _MOST_VOXELS, _ROUNDS = 80.0, 100_000, 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +67,9 @@ def bone_labels(
     """The bones of a user's label map, by the ids that `table` has for them; `ct` in HU on the same grid.
 
     Where a table names a group of bones by several ids (the pelvis, say), the `landmarks` (3,), LPS mm, tell which id
-    is which bone. Where both sides share an id, they are parted half-way between their landmarks. Labels that the table
-    does not name are left out where they are soft tissue. Raises `InputError` if sides cannot be parted, or where the
-    ids are those of another table.
+    is which bone. Where both sides share an id, they are parted half-way between their landmarks, or their middles where
+    no landmark of either is known. Labels that the table does not name are left out where they are soft tissue. Raises
+    `InputError` if sides cannot be parted, or where the ids are those of another table.
     """
     counts = torch.bincount(labels.data.flatten()).numpy()
     _check_table(set(np.flatnonzero(counts).tolist()), table, anatomy)
@@ -137,16 +140,18 @@ def _part_sides(
 ) -> None:
     """Give the voxels of `bone` that lie beyond the plane half-way to its `mirror` to that one, in place."""
     assert anatomy is not None  # without one no bone has a mirror
-    middles = []
-    for name in (bone, mirror):
-        points = [landmarks[mark] for mark in anatomy.landmarks_of(name) if mark in landmarks]
-        if not points:
-            raise InputError(
-                f"label map: {bone} and {mirror} share an id, and no landmark of {name} tells them apart. Give "
-                "landmarks of both sides, or a label map with an id for each."
-            )
-        middles.append(torch.stack(points).double().mean(0))
     ids = [number[bone]]
+    known = {n: [landmarks[mark] for mark in anatomy.landmarks_of(n) if mark in landmarks] for n in (bone, mirror)}
+    if any(known.values()):
+        for name, points in known.items():
+            if not points:
+                raise InputError(
+                    f"label map: {bone} and {mirror} share an id, and no landmark of {name} tells them apart. Give "
+                    "landmarks of both sides, or a label map with an id for each."
+                )
+        middles = [torch.stack(points).double().mean(0) for points in known.values()]
+    else:
+        middles = _middles_of_sides(labels, ids[0], bone, mirror)
     low, high = label_box(labels, ids)
     axes = [torch.arange(a, b, dtype=torch.float64) for a, b in zip(low, high, strict=True)]
     part = labels.data[low[2] : high[2], low[1] : high[1], low[0] : high[0]]
@@ -160,6 +165,28 @@ def _part_sides(
         + axes[0][None, None, :] * towards[0]
     ) > 0
     part[beyond & (part == number[bone])] = number[mirror]
+
+
+def _middles_of_sides(labels: Volume, label: int, bone: str, mirror: str) -> list[Tensor]:
+    """The middles (3,), LPS mm, of `bone` and `mirror`, which share a label: two means of its voxels.
+
+    Raises `InputError` if they lie so near one another that there may be one side alone, and where the names do not say
+    which side is which.
+    """
+    voxels = (labels.data == label).nonzero().flip(1).double()
+    voxels = voxels[:: max(1, len(voxels) // _MOST_VOXELS)]
+    points = transform_points(labels.lps_from_index, voxels)
+    to_left = points[:, 0] > points[:, 0].mean()
+    for _ in range(_ROUNDS):
+        left, right = points[to_left].mean(0), points[~to_left].mean(0)
+        to_left = (points - (left + right) / 2) @ (left - right) > 0
+    is_left = ["left" in name for name in (bone, mirror)]
+    if not abs(float((left - right)[0])) > _SIDES_APART_MM or is_left[0] == is_left[1]:
+        raise InputError(
+            f"label map: {bone} and {mirror} share an id, and may be one side alone. Give landmarks of both sides, or a "
+            "label map with an id for each."
+        )
+    return [left, right] if is_left[0] else [right, left]
 
 
 def _with_groups_told_apart(

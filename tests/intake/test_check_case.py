@@ -580,6 +580,33 @@ def test_many_pixels_below_zero_are_told(files: Path, tmp_path: Path) -> None:
         assert any("of its pixels below 0" in note for note in prepare_scene(read_case(folder)).missing) == told
 
 
+def test_a_device_that_starts_beyond_the_beam_is_a_problem(files: Path, tmp_path: Path) -> None:
+    """A pose in metres: half a millimetre from the source."""
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    for depth, problems in ((500.0, 0), (0.5, 1), (-500.0, 1)):
+        content = case_content()
+        pose = np.eye(4)
+        pose[2, 3] = depth
+        content["device"] = {k: v for k, v in content["device"].items() if k in ("model", "hu", "material", "points")}
+        content["device"]["camera1_from_device"] = pose.tolist()
+        write_content(folder, content)
+        found = check_case(folder, find_start=False)
+        assert len(found.problems) == problems, found.problems
+        assert all("the start pose puts device" in problem for problem in found.problems)
+
+
+def test_a_beam_as_no_carm_has_it_is_a_warning(files: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    for factor, told in ((1.0, False), (0.1, True), (10.0, True)):
+        content = case_content()
+        content["carm"] = {"sdd_mm": 1000 * factor, "pixel_mm": [4, 4], "shape": [48, 40]}
+        write_content(folder, content)
+        warnings = check_case(folder, find_start=False).warnings
+        assert any("Are source distance and pixel size in mm?" in warning for warning in warnings) == told
+
+
 def test_two_views_of_one_pose_are_told(files: Path, tmp_path: Path) -> None:
     folder = tmp_path / "case"
     shutil.copytree(files, folder)

@@ -113,6 +113,20 @@ def test_sides_that_share_an_id_are_parted_between_their_landmarks() -> None:
     assert torch.equal(bones.labels.data > 0, label_map(label_table("pelvic_ref")).data > 0)
 
 
+def test_sides_that_share_an_id_are_parted_between_their_middles_where_no_landmark_is_known() -> None:
+    """Blocks of half the size of bones: so the map is twice as large."""
+    labels = Volume(label_map(label_table("pelvic_ref")).data, axis_aligned((8.0, 8.0, 8.0), (-156.0, -76.0, -116.0)))
+    bones = bone_labels(labels, Volume(ct().data, labels.lps_from_index), label_table("pelvic_ref"), HIP, {})
+    for name, block in BLOCKS.items():
+        assert bones.labels.data[block].unique().tolist() == [bones.ids[name]], name
+
+
+def test_one_side_alone_is_not_parted() -> None:
+    labels = label_map({name: ids for name, ids in label_table("pelvic_ref").items() if not name.endswith("right")})
+    with pytest.raises(InputError, match="hip_left and hip_right share an id, and may be one side alone"):
+        bone_labels(labels, ct(), label_table("pelvic_ref"), HIP, {})
+
+
 def test_sides_that_share_an_id_need_landmarks_of_both() -> None:
     one_side = {name: point for name, point in marks().items() if name != "FH-r"}
     with pytest.raises(InputError, match="femur_left and femur_right share an id, and no landmark of femur_right"):
