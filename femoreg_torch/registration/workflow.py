@@ -1,8 +1,9 @@
 """The registration workflow: from start poses through the steps of a plan (paper, section II-B)."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 from femoreg_torch.case.trace import StageRecord
@@ -36,16 +37,20 @@ def run_plan(
 ) -> Outcome:
     """Run all steps of a plan from where landmarks put the scene's anchor, (4, 4), and where all else starts.
 
-    `camera1_from_anchor` is None where nothing starts from landmarks. Steps that the scene has nothing to do for are
-    left out, and told. Raises `InputError` for a step that cannot run and that others need, or that names an object
-    which no image holds.
+    `camera1_from_anchor` is None where nothing starts from landmarks. What is meant to be beside another object is
+    placed there anew as long as no step has moved it: a leg lies otherwise than in the CT, and the device with it.
+    Steps that the scene has nothing to do for are left out, and told. Raises `InputError` for a step that cannot run
+    and that others need, or that names an object which no image holds.
     """
     poses = scene.start(camera1_from_anchor)
     reasons = {number: _left_out(plan, number, scene, poses) for number in range(len(plan.steps))}
     numbers = [number for number, reason in reasons.items() if reason is None]
     trace: list[StageRecord] = []
+    waiting = {name: pose for name, pose in poses.camera1_from.items() if _is_placed_beside(scene, name)}
     for done, number in enumerate(numbers):
         step = plan.steps[number]
+        waiting = _placed_anew(scene, poses, waiting)
+        poses = replace(poses, camera1_from=poses.camera1_from | waiting)
         if report:
             report(step.name, done / len(numbers))
         if isinstance(step, Calibration):
@@ -62,6 +67,22 @@ def run_plan(
         report("done", 1.0)
     skipped = (f"stage “{plan.steps[n].name}” was left out: {reason}" for n, reason in reasons.items() if reason)
     return Outcome(scene, poses, tuple(trace), tuple(skipped))
+
+
+def _is_placed_beside(scene: Scene, name: str) -> bool:
+    start = scene.objects[name].start
+    return start.nominal and start.camera1_from is None
+
+
+def _placed_anew(scene: Scene, poses: Poses, waiting: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Of objects that wait where they were put (4, 4), those that no step has moved, beside where others are now."""
+    placed: dict[str, Tensor] = {}
+    for name, pose in waiting.items():
+        start = scene.objects[name].start
+        if torch.equal(poses.camera1_from[name], pose):
+            assert start.beside is not None  # or it would not wait
+            placed[name] = (poses.camera1_from | placed)[start.beside] @ start.beside_from_object
+    return placed
 
 
 def _left_out(plan: Plan, number: int, scene: Scene, poses: Poses) -> str | None:

@@ -19,8 +19,8 @@ from femoreg_torch.volume.labels import label_box, looked_up
 
 _OTHER_BONE_HU = 80.0  # mean above which a label that no table names is bone, and a bone's rim does not grow into it
 _NEAR_MM = 15.0  # along every axis: a landmark lies closer than this to its bone
-# From side to side, of two in one label: the middles of hip bones and femora of twenty adults lay 120 mm apart and more,
-# those of the halves of one bone at most 50.
+# From side to side, of two in one label: the middles of hip bones and femora of twenty adults lay 127 mm apart and
+# more, those of the halves of one bone at most 40.
 _SIDES_APART_MM, _MOST_VOXELS, _ROUNDS = 80.0, 100_000, 10
 
 
@@ -67,9 +67,9 @@ def bone_labels(
     """The bones of a user's label map, by the ids that `table` has for them; `ct` in HU on the same grid.
 
     Where a table names a group of bones by several ids (the pelvis, say), the `landmarks` (3,), LPS mm, tell which id
-    is which bone. Where both sides share an id, they are parted half-way between their landmarks, or their middles where
-    no landmark of either is known. Labels that the table does not name are left out where they are soft tissue. Raises
-    `InputError` if sides cannot be parted, or where the ids are those of another table.
+    is which bone. Where both sides share an id, they are parted half-way between their landmarks, or between their
+    middles where no landmark of either is known. Labels that the table does not name are left out where they are soft
+    tissue. Raises `InputError` if sides cannot be parted, or where the ids are those of another table.
     """
     counts = torch.bincount(labels.data.flatten()).numpy()
     _check_table(set(np.flatnonzero(counts).tolist()), table, anatomy)
@@ -183,8 +183,8 @@ def _middles_of_sides(labels: Volume, label: int, bone: str, mirror: str) -> lis
     is_left = ["left" in name for name in (bone, mirror)]
     if not abs(float((left - right)[0])) > _SIDES_APART_MM or is_left[0] == is_left[1]:
         raise InputError(
-            f"label map: {bone} and {mirror} share an id, and may be one side alone. Give landmarks of both sides, or a "
-            "label map with an id for each."
+            f"label map: {bone} and {mirror} share an id, and may be one side alone. Give landmarks of both sides, or "
+            "a label map with an id for each."
         )
     return [left, right] if is_left[0] else [right, left]
 

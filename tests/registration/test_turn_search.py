@@ -68,11 +68,17 @@ def test_any_turn_is_found(scene: Scene, deg: float) -> None:
     assert record.moving == ("probe",)
 
 
-@pytest.mark.parametrize("deg", [0, 4, 33])
-def test_what_a_stage_finds_by_itself_is_not_called_another_turn(scene: Scene, deg: float) -> None:
-    (record,) = SEARCH.run(scene, turned(deg), seed=0)
+@pytest.mark.parametrize("deg", [4, -9, 13, 33])
+def test_a_near_turn_is_found_as_well(scene: Scene, deg: float) -> None:
+    """A stage alone may end at a near turn that fits less well."""
+    before = turned(deg)
+    (record,) = SEARCH.run(scene, before, seed=0)
+    assert off(scene, record.poses)[0] < min(4, off(scene, before)[0])
+
+
+def test_steps_too_wide_for_near_turns_look_at_far_ones_alone(scene: Scene) -> None:
+    (record,) = replace(SEARCH, step_deg=60.0).run(scene, turned(-60), seed=0)
     assert off(scene, record.poses)[0] < 4
-    assert "no other turn" in record.stop
 
 
 def test_a_turn_that_is_right_stays_as_it_is(scene: Scene) -> None:

@@ -1,13 +1,15 @@
 """Stages and whole plans recover known poses; the laws that bodies and stages obey."""
 
 import math
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 from registration_scenes import REFERENCE_POINTS, error, float64, make_scene, off, true_poses
 
 from femoreg_torch.case import Start
+from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, first_view_only, rotation_angle, transform_points
 from femoreg_torch.optimize import Bobyqa, CmaEs, LevenbergMarquardt
@@ -302,3 +304,41 @@ def test_prior_is_half_the_squared_size_of_the_motion() -> None:
     body = Body(("pelvis",), 0, float64(0, 0, 0), float64(math.radians(5), 0, 0, 10, 0, 0))
     objective = stage_objective(lambda d: torch.zeros(len(d), 1).double(), (body,), Prior(10, 20, 0.4))
     torch.testing.assert_close(objective(float64(2, 1)[None]), float64(0.4 * 0.5 * (1 + 0.25)))
+
+
+@dataclass(frozen=True)
+class Turned:
+    """A step that turns one object by so much; it keeps the poses that it began with."""
+
+    name: str
+    thing: str
+    deg: float
+    seen: list[Poses]
+
+    def left_out(self, scene: Scene, poses: Poses) -> str | None:
+        return None
+
+    def run(self, scene: Scene, poses: Poses, seed: int) -> Iterator[StageRecord]:
+        self.seen.append(poses)
+        pose = off(poses.camera1_from[self.thing], REFERENCE_POINTS[self.thing], (self.deg, 0, 0), (0, 3, 0))
+        yield StageRecord(self.name, None, 0.0, 1, 0.0, "done", poses.with_object(self.thing, pose))
+
+
+def test_what_starts_beside_an_object_goes_with_it_until_a_step_moves_it(scene: Scene) -> None:
+    """A leg that is turned otherwise than in the CT takes the device along, which is meant to be beside its bone."""
+    beside = off(torch.eye(4, dtype=torch.float64), float64(0, 0, 0), (5, 0, 0), (20, 0, 0))
+    device = replace(scene.objects["device"], start=Start(beside="femur", beside_from_object=beside))
+    placed = replace(scene, objects={**scene.objects, "device": device})
+    seen: list[Poses] = []
+    steps = [Turned(f"{thing} {deg}", thing, deg, seen) for thing, deg in (("femur", 8), ("device", 3), ("femur", 2))]
+    end = run_plan(placed, Plan("test", tuple(steps)), TRUTH.camera1_from["pelvis"], seed=0).poses
+    first, second, third = (poses.camera1_from for poses in seen)
+    assert not torch.equal(first["femur"], second["femur"])
+    for poses in (first, second):
+        torch.testing.assert_close(poses["device"], poses["femur"] @ beside)
+    assert not torch.equal(third["device"], second["device"])
+    assert torch.equal(end.camera1_from["device"], third["device"])
+    # an object with a nominal pose in camera 1 stays there
+    seen.clear()
+    run_plan(scene, Plan("test", tuple(steps)), TRUTH.camera1_from["pelvis"], seed=0)
+    assert torch.equal(seen[0].camera1_from["device"], seen[1].camera1_from["device"])
