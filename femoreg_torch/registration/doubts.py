@@ -183,7 +183,10 @@ def doubts_about_the_carm(
     the file, however far a refinement went from it; so that way is asked too.
     """
     camera, uncertainty, mean = scene.carm.camera, scene.carm.assumed_uncertainty, covariance.intrinsics.mean
-    advice = "check the C-arm's file, the pixel size, whether the images are cropped, and the voxel size of the CT"
+    advice = (
+        "check the C-arm's file, the pixel size, whether the images are cropped or distorted, the voxel size of the CT, "
+        "and that its label map lies on the bones"
+    )
     doubts = []
     if not abs(float(mean[0])) <= limits.most_intrinsics_sigma:
         fitted = camera.sdd_mm * math.exp(float(mean[0]) * uncertainty.sdd_percent / 100)
@@ -258,7 +261,8 @@ def doubts_about_motion(covariance: PoseCovariance, *, given: bool = False) -> t
     if found in covariance.drifts and found.kind is None:
         return (
             f"in view {found.views[0] + 1}, the {found.objects[0]} lies {mm:.1f} mm and {deg:.1f}° from where the "
-            f"other views show it: it has moved between the views (a leg that turned?){or_given}; take them again",
+            f"other views show it: it has moved between the views (a leg that turned?){or_given}; take them again, or, "
+            "if nothing has moved, check the size of pixels and voxels, and that the bone is whole",
         )
     if found in covariance.drifts:
         return (
