@@ -184,8 +184,8 @@ def doubts_about_the_carm(
     """
     camera, uncertainty, mean = scene.carm.camera, scene.carm.assumed_uncertainty, covariance.intrinsics.mean
     advice = (
-        "check the C-arm's file, the pixel size, whether the images are cropped or distorted, the voxel size of the CT, "
-        "and that its label map lies on the bones"
+        "check the C-arm's file, the pixel size, whether the images are cropped or distorted, the voxel size of the "
+        "CT, and that its label map lies on the bones"
     )
     doubts = []
     if not abs(float(mean[0])) <= limits.most_intrinsics_sigma:
