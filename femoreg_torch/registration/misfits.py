@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.cores import on_all_cores
-from femoreg_torch.geometry import Poses
+from femoreg_torch.geometry import Camera, Poses
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs
-from femoreg_torch.registration.orbit import OrbitSearch, search_orbit
+from femoreg_torch.registration.orbit import Draw, OrbitSearch, drawn_from, search_orbit
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 
@@ -72,7 +72,8 @@ def misfits(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[Misfit, ...]:
     least = _FITS * fits[first, 0]
     bad = [(kind, view) for kind, view in images if fits[kind, view] < least]
     bad = [(kind, view) for kind, view in bad if kind == first or fits.get((first, view), 0.0) >= least]
-    return tuple(_explained(scene, poses, image, fits, imaging) for image in bad)
+    draw = _drawn_once()
+    return tuple(_explained(scene, poses, image, fits, imaging, draw) for image in bad)
 
 
 def fits_like_view_1(scene: Scene, poses: Poses, view: int, imaging: Imaging) -> bool:
@@ -83,7 +84,12 @@ def fits_like_view_1(scene: Scene, poses: Poses, view: int, imaging: Imaging) ->
 
 
 def _explained(
-    scene: Scene, poses: Poses, image: tuple[Kind, int], fits: dict[tuple[Kind, int], float], imaging: Imaging
+    scene: Scene,
+    poses: Poses,
+    image: tuple[Kind, int],
+    fits: dict[tuple[Kind, int], float],
+    imaging: Imaging,
+    draw: Draw,
 ) -> Misfit:
     kind, view = image
     found = Misfit(kind, view, fits[image], fits[scene.first_kind, 0])
@@ -103,16 +109,31 @@ def _explained(
     square = stored.shape[0] == stored.shape[1]
     ways = [way for way in _CHANGES if square or not way.endswith(("90°", "270°"))]
     search = replace(_SEARCH, kinds=[kind], render=scene.shown(poses.camera1_from, kind))
+    as_it_is = 1 - search_orbit(scene, poses, search, view, draw).cost  # first, so that what it draws is there
 
     def similarity(way: str) -> float:
-        return 1 - search_orbit(_changed(scene, kind, view, _CHANGES[way]), poses, search, view).cost
+        return 1 - search_orbit(_changed(scene, kind, view, _CHANGES[way]), poses, search, view, draw).cost
 
     seen = on_all_cores(similarity, ways, scene.device)
     best = max(range(len(ways)), key=lambda n: seen[n])
-    as_it_is = 1 - search_orbit(scene, poses, search, view).cost
     if seen[best] > as_it_is + _BETTER:
         return replace(found, as_stored=ways[best])
     return found
+
+
+def _drawn_once() -> Draw:
+    """`drawn_from` that keeps what it has drawn: the same poses are compared with an image in many ways."""
+    kept: dict[tuple[Kind, Camera, Level, bytes], Tensor] = {}
+
+    def draw(scene: Scene, poses: Poses, search: OrbitSearch, image: tuple[Kind, int], cameras: Tensor) -> Tensor:
+        kind, view = image
+        camera = poses.camera(view, search.level.camera(scene.carm.camera))
+        key = kind, camera, search.level, cameras.cpu().numpy().tobytes()
+        if key not in kept:
+            kept[key] = drawn_from(scene, poses, search, image, cameras)
+        return kept[key]
+
+    return draw
 
 
 def _changed(scene: Scene, kind: Kind, view: int, change: Callable[[Tensor], Tensor]) -> Scene:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -109,14 +109,30 @@ class OrbitSearch:
         yield from one_after_another(records, views)
 
 
-def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> StageRecord:
-    """Place the C-arm of one view (from 0) at the angle of its orbit, from view 1, that fits its images best."""
+Draw = Callable[[Scene, Poses, OrbitSearch, tuple[Kind, int], Tensor], Tensor]
+
+
+def drawn_from(scene: Scene, poses: Poses, search: OrbitSearch, image: tuple[Kind, int], cameras: Tensor) -> Tensor:
+    """What an image (kind, view) would show with the C-arm at the poses `cameras` (N, 4, 4): (N, H, W)."""
+    kind, view = image
+    names = scene.shown(chosen_objects(search.render, poses), kind)
+    where = torch.stack([cameras @ poses.camera1_from[name] for name in names], 1)  # (N, O, 4, 4)
+    camera = poses.camera(view, search.level.camera(scene.carm.camera))
+    volumes = [search.level.volume(scene.objects[name].volume) for name in names]
+    return project(volumes, where, camera, search.level.step_mm)
+
+
+def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int, draw: Draw = drawn_from) -> StageRecord:
+    """Place the C-arm of one view (from 0) at the angle of its orbit, from view 1, that fits its images best.
+
+    `draw` is `drawn_from`, or what gives the same.
+    """
     began = time.perf_counter()
     orbit = scene.carm.orbit(orbit_angles(search.half_range_deg, search.step_deg))  # (N, 4, 4)
-    found = _best(scene, poses, search, view, orbit, search.shift_mm)
+    found = _best(scene, poses, search, view, orbit, search.shift_mm, draw)
     tries = found.tries
     if search.further_deg and found.cost > search.further_above:
-        further = _further(scene, poses, search, view)
+        further = _further(scene, poses, search, view, draw)
         tries += further.tries
         found = min(found, further, key=lambda each: each.cost)
     return StageRecord(
@@ -130,19 +146,21 @@ def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> 
     )
 
 
-def _further(scene: Scene, poses: Poses, search: OrbitSearch, view: int) -> "_Best":
+def _further(scene: Scene, poses: Poses, search: OrbitSearch, view: int, draw: Draw) -> "_Best":
     """The best pose of the C-arm away from the range of its orbit."""
     level = search.level
     coarser = replace(level, pixel_mm=_COARSER_PIXEL * level.pixel_mm, step_mm=_COARSER_STEP * level.step_mm)
     middle = _middle(scene, poses)
     coarse, shift_mm = replace(search, level=coarser), _FURTHER_SHIFT * search.shift_mm
     # by themselves: shifted images of one orbit, whose isocentre is not where the file says, correlated best with all
-    every = [_best(scene, poses, coarse, view, orbit, shift_mm) for orbit in orbits(scene, poses, search.further_deg)]
+    every = [
+        _best(scene, poses, coarse, view, orbit, shift_mm, draw) for orbit in orbits(scene, poses, search.further_deg)
+    ]
     found = min(every, key=lambda each: each.cost)
     grid = torch.cartesian_prod(*(torch.linspace(*each, dtype=torch.float64) for each in _ABOUT_DEG))
     centre = transform_points(found.camera_from_camera1, middle[None])[0]
     about = about_point(rigid(exp_so3(torch.deg2rad(grid))), centre) @ found.camera_from_camera1
-    best = _best(scene, poses, search, view, about, _ABOUT_SHIFT * search.shift_mm)
+    best = _best(scene, poses, search, view, about, _ABOUT_SHIFT * search.shift_mm, draw)
     return replace(best, tries=best.tries + sum(each.tries for each in every))
 
 
@@ -212,11 +230,13 @@ class _Best:
     tries: int
 
 
-def _best(scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: Tensor, shift_mm: float) -> _Best:
+def _best(
+    scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: Tensor, shift_mm: float, draw: Draw
+) -> _Best:
     """Which of the poses (N, 4, 4) of the C-arm fits the images of a view best, each shifted by so much at most."""
-    tried = _shifted(scene, poses, search, view, orbit, shift_mm) if shift_mm else orbit
+    tried = _shifted(scene, poses, search, view, orbit, shift_mm, draw) if shift_mm else orbit
     costs = [
-        prepared(scene, image, search.level, search.similarity)(_drawn(scene, poses, search, image, tried))
+        prepared(scene, image, search.level, search.similarity)(draw(scene, poses, search, image, tried))
         for image in search.images(scene, poses, view)
     ]
     values = torch.stack(costs).mean(0).cpu()  # (N,)
@@ -224,17 +244,9 @@ def _best(scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: Ten
     return _Best(float(values[best]), tried[best], len(orbit) + (len(tried) if shift_mm else 0))
 
 
-def _drawn(scene: Scene, poses: Poses, search: OrbitSearch, image: tuple[Kind, int], cameras: Tensor) -> Tensor:
-    """What an image (kind, view) would show with the C-arm at the poses `cameras` (N, 4, 4): (N, H, W)."""
-    kind, view = image
-    names = scene.shown(chosen_objects(search.render, poses), kind)
-    where = torch.stack([cameras @ poses.camera1_from[name] for name in names], 1)  # (N, O, 4, 4)
-    camera = poses.camera(view, search.level.camera(scene.carm.camera))
-    volumes = [search.level.volume(scene.objects[name].volume) for name in names]
-    return project(volumes, where, camera, search.level.step_mm)
-
-
-def _shifted(scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: Tensor, shift_mm: float) -> Tensor:
+def _shifted(
+    scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: Tensor, shift_mm: float, draw: Draw
+) -> Tensor:
     """The poses (n, 4, 4) of the orbit whose images fit best once shifted, shifted so."""
     images = search.images(scene, poses, view)
     camera = poses.camera(view, search.level.camera(scene.carm.camera))
@@ -245,7 +257,7 @@ def _shifted(scene: Scene, poses: Poses, search: OrbitSearch, view: int, orbit: 
     rows, columns = (shift_mm / mm_per_pixel.mean(0)).ceil().int().tolist()
     maps = [
         shift_correlation(
-            _drawn(scene, poses, search, image, orbit),
+            draw(scene, poses, search, image, orbit),
             search.level.image(scene.image(*image), scene.carm.camera),
             exposed_field(scene, image, search.level),
             (rows, columns),
