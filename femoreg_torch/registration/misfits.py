@@ -16,7 +16,7 @@ from femoreg_torch.geometry import Camera, Poses
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs
-from femoreg_torch.registration.orbit import Draw, OrbitSearch, drawn_from, search_orbit
+from femoreg_torch.registration.orbit import Draw, Drawn, OrbitSearch, drawn_from, search_orbit
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 
@@ -123,9 +123,9 @@ def _explained(
 
 def _drawn_once() -> Draw:
     """`drawn_from` that keeps what it has drawn: the same poses are compared with an image in many ways."""
-    kept: dict[tuple[Kind, Camera, Level, bytes], Tensor] = {}
+    kept: dict[tuple[Kind, Camera, Level, bytes], Drawn] = {}
 
-    def draw(scene: Scene, poses: Poses, search: OrbitSearch, image: tuple[Kind, int], cameras: Tensor) -> Tensor:
+    def draw(scene: Scene, poses: Poses, search: OrbitSearch, image: tuple[Kind, int], cameras: Tensor) -> Drawn:
         kind, view = image
         camera = poses.camera(view, search.level.camera(scene.carm.camera))
         key = kind, camera, search.level, cameras.cpu().numpy().tobytes()

@@ -4,7 +4,9 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,7 +28,7 @@ from femoreg_torch.registration.step import (
     one_after_another,
 )
 from femoreg_torch.settings import check_within
-from femoreg_torch.similarity import Similarity, shift_correlation
+from femoreg_torch.similarity import Similarity, even_gradients, shift_correlation
 
 # Angles that are looked at with the similarity itself. In 16 views of eight cases, 1.1 to 1.4 degrees and up to 24 mm
 # off the orbit, the best of all was among the first four.
@@ -109,17 +111,29 @@ class OrbitSearch:
         yield from one_after_another(records, views)
 
 
-Draw = Callable[[Scene, Poses, OrbitSearch, tuple[Kind, int], Tensor], Tensor]
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What an image would show from many poses of the C-arm."""
+
+    images: Tensor  # (N, H, W)
+
+    @cached_property
+    def gradients(self) -> np.ndarray:
+        """What `shift_correlation` compares (N, H, W, 2)."""
+        return even_gradients(self.images)
 
 
-def drawn_from(scene: Scene, poses: Poses, search: OrbitSearch, image: tuple[Kind, int], cameras: Tensor) -> Tensor:
-    """What an image (kind, view) would show with the C-arm at the poses `cameras` (N, 4, 4): (N, H, W)."""
+Draw = Callable[[Scene, Poses, OrbitSearch, tuple[Kind, int], Tensor], Drawn]
+
+
+def drawn_from(scene: Scene, poses: Poses, search: OrbitSearch, image: tuple[Kind, int], cameras: Tensor) -> Drawn:
+    """What an image (kind, view) would show with the C-arm at the poses `cameras` (N, 4, 4)."""
     kind, view = image
     names = scene.shown(chosen_objects(search.render, poses), kind)
     where = torch.stack([cameras @ poses.camera1_from[name] for name in names], 1)  # (N, O, 4, 4)
     camera = poses.camera(view, search.level.camera(scene.carm.camera))
     volumes = [search.level.volume(scene.objects[name].volume) for name in names]
-    return project(volumes, where, camera, search.level.step_mm)
+    return Drawn(project(volumes, where, camera, search.level.step_mm))
 
 
 def search_orbit(scene: Scene, poses: Poses, search: OrbitSearch, view: int, draw: Draw = drawn_from) -> StageRecord:
@@ -236,7 +250,7 @@ def _best(
     """Which of the poses (N, 4, 4) of the C-arm fits the images of a view best, each shifted by so much at most."""
     tried = _shifted(scene, poses, search, view, orbit, shift_mm, draw) if shift_mm else orbit
     costs = [
-        prepared(scene, image, search.level, search.similarity)(draw(scene, poses, search, image, tried))
+        prepared(scene, image, search.level, search.similarity)(draw(scene, poses, search, image, tried).images)
         for image in search.images(scene, poses, view)
     ]
     values = torch.stack(costs).mean(0).cpu()  # (N,)
@@ -257,7 +271,7 @@ def _shifted(
     rows, columns = (shift_mm / mm_per_pixel.mean(0)).ceil().int().tolist()
     maps = [
         shift_correlation(
-            draw(scene, poses, search, image, orbit),
+            draw(scene, poses, search, image, orbit).gradients,
             search.level.image(scene.image(*image), scene.carm.camera),
             exposed_field(scene, image, search.level),
             (rows, columns),

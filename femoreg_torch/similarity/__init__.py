@@ -12,7 +12,7 @@ from femoreg_torch.similarity.kinds import read_similarity
 from femoreg_torch.similarity.ncc import Ncc
 from femoreg_torch.similarity.orientation import GradientOrientation
 from femoreg_torch.similarity.quadratic import similarity_quadratic, similarity_quadratics
-from femoreg_torch.similarity.shift import shift_correlation
+from femoreg_torch.similarity.shift import even_gradients, shift_correlation
 from femoreg_torch.similarity.watched import against_field
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "SmoothFixedSimilarity",
     "against_field",
     "derivative_taps",
+    "even_gradients",
     "image_gradients",
     "read_similarity",
     "shift_correlation",

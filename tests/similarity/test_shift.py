@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from femoreg_torch.similarity import shift_correlation
+from femoreg_torch.similarity import even_gradients, shift_correlation
 
 HIDDEN = torch.zeros(48, 60, dtype=torch.bool)
 HIDDEN[:, :14] = True
@@ -27,7 +27,7 @@ def test_a_shifted_image_is_found_where_it_was_shifted_to(rows: int, columns: in
     if shaded:  # what is hidden is something else, and does not count
         fixed[HIDDEN] = 5 * torch.randn(int(HIDDEN.sum()), generator=torch.Generator().manual_seed(1))
         field = ~torch.nn.functional.max_pool2d(HIDDEN[None].float(), 7, 1, 3)[0].bool()
-    found = shift_correlation(torch.stack([smooth(2, 48, 60), moving]), fixed, field, (8, 10))
+    found = shift_correlation(even_gradients(torch.stack([smooth(2, 48, 60), moving])), fixed, field, (8, 10))
     assert found.shape == (2, 17, 21)
     assert divmod(int(found[1].argmax()), 21) == (8 + rows, 10 + columns)
     assert found[1].max() > 0.55

@@ -18,20 +18,26 @@ from femoreg_torch.volume import read_label_map, write_volume
 
 # Of one simulated procedure, mm: the accuracy study's largest errors are a third of these.
 LIMITS = {"pelvis": 0.5, "femur": 1.0, "device": 0.5, "view2": 0.5, "view3": 0.5}
-ONE_STEP = """
-extends: fast
+HARDLY_LOOKS = """
 steps:
-  - {name: "femur in view 1, coarse", remove: true}
-  - {name: pelvis and femur in view 1, remove: true}
-  - {name: anatomy in all views, remove: true}
-  - {name: "C-arm of the other views, coarse", remove: true}
-  - {name: "device in all views, coarse", remove: true}
-  - {name: everything together, remove: true}
-  - {name: "everything together, fine", remove: true}
-  - {name: "device alone, finest", remove: true}
-  - name: pelvis in view 1, coarse
+  - name: pelvis in view 1
+    kind: stage
+    images: first
+    kinds: [anatomy]
+    render: [pelvis, femur]
+    bodies: [{move: [pelvis, femur], rotation_deg: [5, 5, 5], translation_mm: [6, 6, 30]}]
     level: {pixel_mm: 6.2, step_mm: 3}
-    optimiser: {kind: levenberg_marquardt, candidates: 0, max_iterations: 1}
+    similarity: {kind: grad_ncc, patch_radius: 3}
+    optimiser: {kind: levenberg_marquardt, max_iterations: 3}
+  - name: orbit search
+    kind: orbit_search
+    kinds: [anatomy]
+    render: [pelvis, femur]
+    half_range_deg: 45
+    step_deg: 3
+    shift_mm: 30
+    level: {pixel_mm: 6.2, step_mm: 3}
+    similarity: {kind: grad_ncc, patch_radius: 3}
 """
 
 
@@ -120,8 +126,8 @@ def test_other_label_ids_give_the_same_scene_bit_for_bit(demo: Path, tmp_path: P
 
 def test_a_result_that_is_not_trusted_ends_in_status_3_if_trust_is_required(demo: Path, tmp_path: Path) -> None:
     """A preset of one's own that hardly looks: its result says that it must not be trusted."""
-    (tmp_path / "one_step.yaml").write_text(ONE_STEP, encoding="utf-8")
-    arguments = ["register", str(demo / "case"), "--preset", str(tmp_path / "one_step.yaml"), "--out"]
+    (tmp_path / "hardly_looks.yaml").write_text(HARDLY_LOOKS, encoding="utf-8")
+    arguments = ["register", str(demo / "case"), "--preset", str(tmp_path / "hardly_looks.yaml"), "--out"]
     assert main([*arguments, str(tmp_path / "run"), "--require-trust"]) == 3
     result = result_of(tmp_path / "run")
     assert result["trusted"] is False
@@ -133,8 +139,8 @@ def test_a_result_that_is_not_trusted_ends_in_status_3_if_trust_is_required(demo
 def test_a_registration_starts_where_a_file_says(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "one_step.yaml").write_text(ONE_STEP, encoding="utf-8")
-    arguments = ["register", str(demo / "case"), "--preset", str(tmp_path / "one_step.yaml"), "--out"]
+    (tmp_path / "hardly_looks.yaml").write_text(HARDLY_LOOKS, encoding="utf-8")
+    arguments = ["register", str(demo / "case"), "--preset", str(tmp_path / "hardly_looks.yaml"), "--out"]
     start = ["--start", str(demo / "run" / "result.json")]
     assert main([*arguments, str(tmp_path / "run"), *start]) == 0
     begun, found = (result_of(run) for run in (tmp_path / "run", demo / "run"))
@@ -152,8 +158,8 @@ def test_a_registration_starts_where_a_file_says(
 def test_a_batch_keeps_what_is_done_and_tells_what_was_refused(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    preset, runs = tmp_path / "one_step.yaml", tmp_path / "runs"
-    preset.write_text(ONE_STEP, encoding="utf-8")
+    preset, runs = tmp_path / "hardly_looks.yaml", tmp_path / "runs"
+    preset.write_text(HARDLY_LOOKS, encoding="utf-8")
     cases = [tmp_path / name for name in ("first", "second", "broken")]
     for case in cases:
         shutil.copytree(demo / "case", case)

@@ -14,6 +14,7 @@ from sim.study.procedures import Procedure
 from sim.study.protocol import load_protocol
 from sim.study.work import Setting, registered, settings_of
 
+pytestmark = pytest.mark.usefixtures("nothing_in_doubt")
 PROCEDURE = Procedure(number=1, patient="2", side="right", seed=5)
 (USUAL,) = settings_of(load_protocol("accuracy"), "accuracy").values()
 

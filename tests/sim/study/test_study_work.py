@@ -18,6 +18,7 @@ from sim.study.store import Run
 from sim.study.study import plan_study, run_study
 from sim.study.work import Setting, Simulated, settings_of
 
+pytestmark = pytest.mark.usefixtures("nothing_in_doubt")
 SHORT = {  # one stage: the pelvis in the first view, on pixels of 3.1 mm
     "steps": [
         {

@@ -26,6 +26,8 @@ from sim.study.study import run_study
 from sim.study.work import settings_of
 from sim.study.yardsticks import plan_yardstick, take_earlier
 
+pytestmark = pytest.mark.usefixtures("nothing_in_doubt")
+
 
 def test_cases_are_made_once_and_runs_are_kept(coarse_root: Path, tmp_path: Path) -> None:
     protocol = replace(load_protocol("accuracy"), simulation=str(coarse_root / SIMULATION))
