@@ -37,8 +37,8 @@ def run_plan(
 ) -> Outcome:
     """Run all steps of a plan from where landmarks put the scene's anchor, (4, 4), and where all else starts.
 
-    `camera1_from_anchor` is None where nothing starts from landmarks. What is meant to be beside another object is
-    placed there anew as long as no step has moved it: a leg lies otherwise than in the CT, and the device with it.
+    `camera1_from_anchor` is None where nothing starts from landmarks. What starts beside another object is placed
+    there anew as long as no step has moved it: a leg lies otherwise than in the CT, and the device with it.
     Steps that the scene has nothing to do for are left out, and told. Raises `InputError` for a step that cannot run
     and that others need, or that names an object which no image holds.
     """
@@ -71,7 +71,7 @@ def run_plan(
 
 def _is_placed_beside(scene: Scene, name: str) -> bool:
     start = scene.objects[name].start
-    return start.nominal and start.camera1_from is None
+    return start.beside is not None and start.camera1_from is None
 
 
 def _placed_anew(scene: Scene, poses: Poses, waiting: Mapping[str, Tensor]) -> dict[str, Tensor]:
