@@ -19,7 +19,7 @@ from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.quality import Limits, _Judged, _reason, _unsettled, _unturned, _vague, assess
 from femoreg_torch.registration.run import _started_at
 from femoreg_torch.registration.scene import RigidObject, Scene
-from femoreg_torch.registration.turns import loss_by_turning
+from femoreg_torch.registration.turns import loss_about_guide, loss_by_turning
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume, axis_aligned
 
@@ -148,7 +148,8 @@ def test_a_start_that_is_given_does_not_change_what_is_expected(scene: Scene) ->
 
 @pytest.mark.parametrize(("lost", "told"), [(0.2, True), (0.001, False), (-0.01, False), (math.nan, False)])
 def test_a_turn_that_costs_nothing_is_not_told(lost: float, told: bool) -> None:
-    assert (_unturned("device", lost, Limits()) is None) is told
+    assert (_unturned("device", (lost, math.inf), Limits()) is None) is told
+    assert (_unturned("device", (math.inf, lost / 16), Limits()) is None) is told
 
 
 def test_a_device_is_turned_about_what_is_in_view(scene: Scene) -> None:
@@ -182,6 +183,34 @@ def test_a_device_is_turned_about_what_is_in_view(scene: Scene) -> None:
     )
     assert found > 0.05
     assert blind < 0.01
+
+
+def test_a_device_is_turned_about_its_guide_as_well(scene: Scene) -> None:
+    """A round guide with a round plate, half of which a shutter hides: the long axis of the rest leans to one side."""
+    z, y, x = torch.meshgrid(*[torch.arange(n).double() for n in (120, 71, 71)], indexing="ij")
+    x, y, z = x - 35, y - 35, z - 20
+    data = 0.2 * ((x.hypot(y) < 5) & (z.abs() < 20) | (x.hypot(y) < 30) & (z > 60) & (z < 70))
+    volume = Volume(data.float(), axis_aligned((1.0, 1.0, 1.0), (-35, -35, -20)))
+    pose = TRUTH.camera1_from["device"]
+    poses = Poses(TRUTH.camera_from_camera1, {"probe": pose})
+    base, tip = float64(0, 0, 20), float64(0, 0, -20)
+    images, fields = [], []
+    for view in range(scene.views):
+        camera, place = scene.camera(poses, view), poses.camera_from("probe")[view]
+        images.append(project(volume, place[None], camera, 0.5)[0])
+        middle = project_points(camera, transform_points(place, float64(0, 0, 65)[None]))[0]
+        fields.append((torch.arange(camera.shape[1]) < middle[0] + 3).expand(camera.shape).clone())
+    probe = RigidObject(volume, float64(0, 0, 0), ("device",), Start(pose), parts=(volume,), sharp=True)
+    shown = replace(
+        scene, images={"device": tuple(images)}, fields={"device": tuple(fields)}, tissue=None, outline=None
+    )
+    objects = {"probe": replace(probe, guide=(base, tip))}
+    long, guide = (
+        loss(replace(shown, objects=objects), poses, "probe", Level(3.0, 1.0), GradNcc(4), PLAIN)
+        for loss in (loss_by_turning, loss_about_guide)
+    )
+    assert guide < Limits().least_loss_about_guide
+    assert long > Limits().least_loss_by_turning
 
 
 @pytest.mark.parametrize(
