@@ -59,8 +59,8 @@ class Limits:
     # Half of `TOLD`: right turns lost 0.0044 to 0.0076 in three foreign cases, and were 0.1° off at most;
     # those that no image told lost 0.0003 at most, and were up to 3° off.
     least_loss_by_turning: float = TOLD / 2
-    # Four of another simulator whose turn no image told lost 0.0001 at most; 12 right ones of it and one more 0.012 and
-    # more, a thirteenth 0.0004.
+    # Of a simulator of another make four whose turn no image told lost 0.0001 at most. Of that and one more simulator
+    # 14 right ones lost 0.006 and more, a fifteenth 0.0004.
     least_loss_about_guide: float = 0.00025
     rival_cost: float = 0.005  # another start of a stage that ended so little above the best,
     rival_deg: float = 15.0  # but so far away
