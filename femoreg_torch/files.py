@@ -144,14 +144,10 @@ def check_folder(path: Path, sources: Iterable[Path] = ()) -> Path:
     names = [real.name, *(parent.name for parent in real.parents[:missing])]
     if missing > _MOST_NEW or any(len(os.fsencode(name)) > _LONGEST_NAME for name in names):
         raise InputError(f"{shortened(real, 200)}: its name, or the path to it, is too long. Choose another one.")
-    try:  # to make a folder there: permissions alone tell nothing of a read-only disk
-        Path(tempfile.mkdtemp(prefix=".", suffix=_SUFFIX, dir=above)).rmdir()
-    except OSError as error:
-        if error.errno == errno.ENOSPC:
-            raise
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         raise InputError(
             f"{real}: cannot be written, {above} is no folder, read-only or not yours. Choose another place."
-        ) from error
+        )
     return real
 
 
