@@ -37,9 +37,9 @@ def register(
         out: Folder to write the result to. What an earlier run wrote there is replaced as a whole.
         preset: Workflow in configs/registration, or a YAML file: `fast` (derivatives of the images, everything refined
             together), `fast_wide_device` (as `fast`, for a nominal pose that is far off), `fast_carm_as_told` (as
-            `fast`, but the C-arm's file is not refined), `device_fiducial` (as `fast`, but
-            the device tells the C-arm's poses first), `paper` (images and optimisers of the paper, minutes),
-            `derivative_free` (as `paper`, but coarse) or `rigid` (any rigid objects).
+            `fast`, but the C-arm's file is not refined), `device_fiducial` (as `fast`, but the device tells the
+            C-arm's poses first), `paper` (images and optimisers of the paper, minutes), `derivative_free` (as `paper`,
+            but coarse) or `rigid` (any rigid objects).
         seed: Of the random searches; the same seed gives the same result.
         weights: Weights of the landmark network, if not those shipped (safetensors).
         landmarks: Landmarks in the first image, picked by hand or found by another network, in place of the network's:

@@ -32,7 +32,7 @@ from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.roundness import Axis
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
-from femoreg_torch.registration.turns import TOLD, loss_about_guide, loss_by_turning
+from femoreg_torch.registration.turns import TOLD, losses_by_turning
 from femoreg_torch.similarity import GradNcc
 
 _LEVEL = Level(pixel_mm=1.55, step_mm=0.5)
@@ -96,12 +96,7 @@ def assess(
         for name in poses.camera1_from
     }
     devices = [name for name in by_name if not scene.objects[name].classes and scene.objects[name].axis is None]
-
-    def lost_by_turning(name: str) -> list[float]:
-        asked = loss_by_turning, loss_about_guide
-        return on_all_cores(lambda loss: loss(scene, poses, name, _LEVEL, _SIMILARITY, imaging), asked, scene.device)
-
-    lost = {name: lost_by_turning(name) for name in devices}
+    lost = {name: losses_by_turning(scene, poses, name, _LEVEL, _SIMILARITY, imaging) for name in devices}
     return {
         name: _assess_object(scene, poses, name, views, covariance, limits, trace, lost.get(name))
         for name, views in by_name.items()
@@ -176,7 +171,7 @@ def _assess_object(
     covariance: PoseCovariance,
     limits: Limits,
     trace: Sequence[StageRecord],
-    lost_by_turning: Sequence[float] | None,
+    lost_by_turning: tuple[float, float] | None,
 ) -> ObjectQuality:
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
@@ -235,7 +230,7 @@ class _Judged:
         return cls(sigma[:3], sigma[3:], rest @ pull, beside)
 
 
-def _unturned(name: str, lost: Sequence[float] | None, limits: Limits) -> str | None:
+def _unturned(name: str, lost: tuple[float, float] | None, limits: Limits) -> str | None:
     """`lost` is what the images lose by turning the object about its long axis, and its guide.
 
     None where that is not asked; nan counts as nothing.

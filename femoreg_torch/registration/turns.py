@@ -30,46 +30,32 @@ _FILLED = 0.004  # 1/mm: a fifth of water
 _MOST_POINTS = 20_000
 
 
-def loss_by_turning(
+def losses_by_turning(
     scene: Scene, poses: Poses, name: str, level: Level, similarity: Similarity, imaging: Imaging
-) -> float:
-    """What the images lose of their mean similarity, at least, if an object is turned about its long axis.
+) -> tuple[float, float]:
+    """What the images lose of their mean similarity, at least, if an object is turned about its long axis; its guide.
 
-    Infinite where no image shows it. nan where a similarity is.
+    Infinite where no image shows it, and about a guide that is not known. nan where a similarity is.
     """
     points = _points_in_view(scene, poses, name)
     if len(points) < 2:
-        return math.inf
-    return _loss(scene, poses, name, (points.mean(0), long_axis(points)), level, similarity, imaging)
+        return math.inf, math.inf
+    images, drawn = scene.there(scene.objects[name].shown_in, range(scene.views)), tuple(poses.camera1_from)
+    turns = torch.tensor([0, *_TURNS_DEG], dtype=torch.float64)[:, None]
 
+    def loss(through: Tensor, along: Tensor) -> float:
+        """About the line through a point (3,) along a direction (3,) in camera 1."""
+        body = Body((name,), 0, through, torch.tensor([math.pi / 180] * 3 + [0] * 3, dtype=torch.float64))
+        costs = image_costs(scene, poses, (body,), drawn, images, level, similarity, imaging=imaging)
+        found = costs(turns * along).mean(1)
+        return float((found[1:] - found[0]).min())
 
-def loss_about_guide(
-    scene: Scene, poses: Poses, name: str, level: Level, similarity: Similarity, imaging: Imaging
-) -> float:
-    """The same about an object's guide; infinite also where none is known."""
+    about_long_axis = loss(points.mean(0), long_axis(points))
     guide = scene.objects[name].guide
-    if guide is None or len(_points_in_view(scene, poses, name)) < 2:
-        return math.inf
+    if guide is None:
+        return about_long_axis, math.inf
     base, tip = transform_points(poses.camera1_from[name], torch.stack(guide))
-    return _loss(scene, poses, name, (base, (tip - base) / (tip - base).norm()), level, similarity, imaging)
-
-
-def _loss(
-    scene: Scene,
-    poses: Poses,
-    name: str,
-    line: tuple[Tensor, Tensor],
-    level: Level,
-    similarity: Similarity,
-    imaging: Imaging,
-) -> float:
-    """What turns about a line, through a point (3,) along a direction (3,) in camera 1, lose at least."""
-    through, along = line
-    images = scene.there(scene.objects[name].shown_in, range(scene.views))
-    body = Body((name,), 0, through, torch.tensor([math.pi / 180] * 3 + [0] * 3, dtype=torch.float64))
-    costs = image_costs(scene, poses, (body,), tuple(poses.camera1_from), images, level, similarity, imaging=imaging)
-    found = costs(torch.tensor([0, *_TURNS_DEG], dtype=torch.float64)[:, None] * along).mean(1)
-    return float((found[1:] - found[0]).min())
+    return about_long_axis, loss(base, (tip - base) / (tip - base).norm())
 
 
 def long_axis(points: Tensor) -> Tensor:
