@@ -16,7 +16,8 @@ import femoreg_torch as femoreg
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.fluoro import write_image
 from femoreg_torch.geometry import about_point, exp_so3, pose_difference, project_points, rigid, transform_points
-from femoreg_torch.registration.prepare import read_bones, reference_point
+from femoreg_torch.registration.prepare.bones import read_bones
+from femoreg_torch.registration.prepare.reference import reference_point
 from femoreg_torch.volume import hu_to_attenuation, structure_attenuation, write_landmarks, write_volume
 from sim.patient import make_patient
 

@@ -24,8 +24,8 @@ from femoreg_torch.neighbours.deepfluoro import (
     read_specimen,
     specimens,
 )
+from femoreg_torch.registration.prepare.outline import outline_of
 from femoreg_torch.registration.scene import Outline
-from femoreg_torch.registration.silhouette import outline_of
 from femoreg_torch.volume import BoneLabels, Volume, bone_labels
 from sim.labelled.image_files import read_labelled
 from training.augmentation import inside

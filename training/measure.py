@@ -18,7 +18,7 @@ from femoreg_torch.detect.tta import AUGMENTATIONS, Augmentation
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display, Source
 from femoreg_torch.geometry import rotation_angle, transform_points
-from femoreg_torch.registration.start import find_start
+from femoreg_torch.registration.start.find import find_start
 from training.augmentation import inside
 from training.labelled import LabelledImage
 

@@ -11,7 +11,7 @@ from femoreg_torch.case.femoroplasty import ANATOMY_IMAGES, PELVIS, femoral_head
 from femoreg_torch.case.model import Side
 from femoreg_torch.geometry import load_carm, transform_points
 from femoreg_torch.registration import Scene, load_plan, run_plan
-from femoreg_torch.registration.prepare import ct_objects
+from femoreg_torch.registration.prepare.bones import ct_objects
 from femoreg_torch.volume import BoneLabels, Volume
 from sim.labelled.patient_folders import find_patient, read_patient
 from sim.study.capture import first_stages

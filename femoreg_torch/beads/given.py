@@ -13,7 +13,7 @@ from femoreg_torch.case import Case
 from femoreg_torch.case.fields import Fields
 from femoreg_torch.delimited import check_decimal_marks, decimal, read_csv
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.registration.prepare import read_bones
+from femoreg_torch.registration.prepare.bones import read_bones
 from femoreg_torch.text import read_yaml_and_lines
 from femoreg_torch.volume import read_landmarks
 

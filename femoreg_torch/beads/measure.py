@@ -21,7 +21,7 @@ from femoreg_torch.case import Case
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Poses, invert_rigid, project_points, transform_points
-from femoreg_torch.registration.prepare import ByKind, read_images
+from femoreg_torch.registration.prepare.images import ByKind, read_images
 
 # longer by shorter side of a pixel: of drawn shadows of 4 pixels radius, in noise of 0.01, centres are off by 0.014 px
 # (root mean square) at 1 and at 1.05, by 0.022 at 1.1 and 0.040 at 1.15; at 1.2 half of them are found, at 1.25 none

@@ -18,7 +18,8 @@ from femoreg_torch.case import Case, PlannedPath
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro.display import Display, Source
 from femoreg_torch.geometry import Poses, euler_xyz_deg, invert_rigid, log_so3, rotation_angle, transform_points
-from femoreg_torch.registration.prepare import read_bones, reference_point
+from femoreg_torch.registration.prepare.bones import read_bones
+from femoreg_torch.registration.prepare.reference import reference_point
 from femoreg_torch.registration.scene import Scene
 
 _PAPER_FROM_LPS = [2, 0, 1]  # IS, LR and AP among left, back and head

@@ -44,7 +44,7 @@ from femoreg_torch.intake.found import Found, alike_together
 from femoreg_torch.intake.planes import Picture, side_by_side, stacked
 from femoreg_torch.intake.start_picture import picture_of_start
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
-from femoreg_torch.registration.models import (
+from femoreg_torch.registration.prepare.models import (
     BEYOND_MM,
     GUIDE_MM,
     model_attenuation,
@@ -52,7 +52,7 @@ from femoreg_torch.registration.models import (
     told_of_leaning,
     told_of_middle,
 )
-from femoreg_torch.registration.prepare import check_start
+from femoreg_torch.registration.prepare.nominal import check_start
 from femoreg_torch.volume import NOBODY, is_in_ras, patient_of, read_ct_told, read_landmarks
 from femoreg_torch.volume.borders import cut_bones
 from femoreg_torch.volume.round_field import round_field

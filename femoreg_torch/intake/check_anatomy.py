@@ -20,7 +20,7 @@ from femoreg_torch.intake.found import Found
 from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.pnp import MINIMUM
-from femoreg_torch.registration.plan_and_landmarks import MOST_OFF_BONE_MM, MOST_OFF_HEAD_MM
+from femoreg_torch.registration.prepare.plan_and_landmarks import MOST_OFF_BONE_MM, MOST_OFF_HEAD_MM
 from femoreg_torch.segment import Head, doubted_radius, doubted_slices, head_of
 from femoreg_torch.volume import (
     NOBODY,

@@ -17,10 +17,11 @@ from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
 from femoreg_torch.intake.planes import Picture
 from femoreg_torch.registration import Scene, load_plan, prepare_scene
-from femoreg_torch.registration.another_view import start_from_a_view
-from femoreg_torch.registration.doubts import doubts_about_the_guide, doubts_about_the_plan
+from femoreg_torch.registration.doubts.plan import doubts_about_the_guide, doubts_about_the_plan
 from femoreg_torch.registration.run import network_detector
-from femoreg_torch.registration.start import look_at, start_by_landmarks
+from femoreg_torch.registration.start.another_view import start_from_a_view
+from femoreg_torch.registration.start.by_hand import start_by_landmarks
+from femoreg_torch.registration.start.find import look_at
 
 _WIDTH_PX = 560
 _PRESET = "fast"  # whose steps look for view 1 from another view, where it shows too little

@@ -22,8 +22,8 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.files import write_json, write_text
 from femoreg_torch.geometry import invert_rigid
 from femoreg_torch.navigation import transform_text
-from femoreg_torch.registration.models import model_attenuation
-from femoreg_torch.registration.prepare import read_bones
+from femoreg_torch.registration.prepare.bones import read_bones
+from femoreg_torch.registration.prepare.models import model_attenuation
 from femoreg_torch.volume import BoneLabels, Volume, write_landmarks
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from femoreg_torch.planning.laws import Material
 from femoreg_torch.planning.loading import make_loading
 from femoreg_torch.planning.model import Bone, Model, make_bone, make_model, with_cement
 from femoreg_torch.planning.settings import Planning
-from femoreg_torch.registration.prepare import read_bones
+from femoreg_torch.registration.prepare.bones import read_bones
 from femoreg_torch.volume import Volume
 
 Array = NDArray[np.float64]

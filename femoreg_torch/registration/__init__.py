@@ -5,7 +5,7 @@ from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import Imaging, Prior
 from femoreg_torch.registration.orbit import OrbitSearch
 from femoreg_torch.registration.plan import Plan, load_plan, plan_from
-from femoreg_torch.registration.prepare import prepare_scene
+from femoreg_torch.registration.prepare.scene import prepare_scene
 from femoreg_torch.registration.run import register
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.registration.stage import BodyPlan, Stage

@@ -8,8 +8,8 @@ from femoreg_torch.configs import load_preset
 from femoreg_torch.errors import InputError
 from femoreg_torch.extensions import find, pop_kind, record_of
 from femoreg_torch.optimize import Optimiser, read_optimiser
-from femoreg_torch.registration.calibration import Calibration
 from femoreg_torch.registration.imaging import PLAIN, Imaging
+from femoreg_torch.registration.materials.calibration import Calibration
 from femoreg_torch.registration.orbit import OrbitSearch
 from femoreg_torch.registration.stage import Stage
 from femoreg_torch.registration.step import Step

@@ -20,21 +20,18 @@ from femoreg_torch.detect import detect, load_network
 from femoreg_torch.drr import CPU
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import CArm, Poses, check_rigid, invert_rigid, rotation_angle
-from femoreg_torch.registration.another_view import start_from_a_view
-from femoreg_torch.registration.device_doubts import notes_on_unseen_tips
-from femoreg_torch.registration.display_told import doubts_about_the_display
-from femoreg_torch.registration.doubts import doubts
+from femoreg_torch.registration.doubts.ask import doubts
+from femoreg_torch.registration.doubts.device import notes_on_unseen_tips
 from femoreg_torch.registration.kernels import load_kernels
 from femoreg_torch.registration.plan import Plan, load_plan
-from femoreg_torch.registration.prepare import check_starts, prepare_scene
+from femoreg_torch.registration.prepare.nominal import check_starts
+from femoreg_torch.registration.prepare.scene import prepare_scene
 from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance, path_covariance
 from femoreg_torch.registration.scene import Scene
-from femoreg_torch.registration.start import (
-    Detector,
-    look_at,
-    start_by_landmarks,
-    with_segmentations,
-)
+from femoreg_torch.registration.start.another_view import start_from_a_view
+from femoreg_torch.registration.start.by_hand import start_by_landmarks
+from femoreg_torch.registration.start.display_told import doubts_about_the_display
+from femoreg_torch.registration.start.find import Detector, look_at, with_segmentations
 from femoreg_torch.registration.turn_search import turned_from_where_told
 from femoreg_torch.registration.workflow import Follow, Report, run_plan
 

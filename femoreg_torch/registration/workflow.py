@@ -9,7 +9,7 @@ from torch import Tensor
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
-from femoreg_torch.registration.calibration import Calibration
+from femoreg_torch.registration.materials.calibration import Calibration
 from femoreg_torch.registration.plan import Plan
 from femoreg_torch.registration.scene import Scene
 

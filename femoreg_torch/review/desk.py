@@ -11,7 +11,7 @@ from femoreg_torch.evaluation import evaluation_page
 from femoreg_torch.evaluation.fit import check_fits
 from femoreg_torch.registration import Scene
 from femoreg_torch.registration.run import network_detector
-from femoreg_torch.registration.start import look_at
+from femoreg_torch.registration.start.find import look_at
 from femoreg_torch.review.drawing import Edges, drawing, pictures
 from femoreg_torch.review.kept import forget, keep_landmarks, keep_poses, landmarks_path, start_path, with_kept
 from femoreg_torch.review.placing import Mark, Move, Placed, by_landmarks, marked, moved, placed_at_first, unmarked

@@ -11,9 +11,9 @@ from femoreg_torch.case import Case, Result
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.geometry import Poses, about_point, exp_se3, invert_rigid, rigid
 from femoreg_torch.registration import Scene
-from femoreg_torch.registration.prepare import view_distortion
+from femoreg_torch.registration.prepare.images import view_distortion
 from femoreg_torch.registration.scene import reference_point_in_view
-from femoreg_torch.registration.start import start_by_landmarks
+from femoreg_torch.registration.start.by_hand import start_by_landmarks
 from femoreg_torch.settings import check_within
 
 ALL = "all objects"

@@ -10,7 +10,7 @@ from torch import Tensor
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.detect import Detection, LandmarkNetwork, detect
 from femoreg_torch.geometry import Camera, project_points, transform_points
-from femoreg_torch.registration.start import Detector
+from femoreg_torch.registration.start.find import Detector
 from femoreg_torch.settings import check_within
 
 

@@ -22,7 +22,7 @@ from femoreg_torch.evaluation import errors, reference_points
 from femoreg_torch.files import plain, temporary_file, write_text
 from femoreg_torch.geometry import CArm, Poses
 from femoreg_torch.registration import Plan, Stage
-from femoreg_torch.registration.prepare import prepare_scene
+from femoreg_torch.registration.prepare.scene import prepare_scene
 from femoreg_torch.settings import read_record
 from femoreg_torch.statistics.limit_tables import (
     ALL_IMAGES,

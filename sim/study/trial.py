@@ -26,7 +26,7 @@ from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.registration import Plan
 from femoreg_torch.registration.run import register_scene
 from femoreg_torch.registration.scene import Scene
-from femoreg_torch.registration.start import Detector
+from femoreg_torch.registration.start.find import Detector
 from sim.study.procedures import Procedure
 
 _STARTED = (PELVIS, FEMUR, DEVICE)  # objects whose errors at the start are kept

@@ -39,7 +39,7 @@ from femoreg_torch.neighbours.xreg import read_projections
 from femoreg_torch.planning.report import CEMENT_NAME, read_plan
 from femoreg_torch.planning.settings import load_planning
 from femoreg_torch.registration.plan import load_plan
-from femoreg_torch.registration.prepare import prepare_scene
+from femoreg_torch.registration.prepare.scene import prepare_scene
 from femoreg_torch.volume import read_ct, read_label_map, read_landmarks, read_mesh
 from femoreg_torch.volume.mesh_files import read_bodies
 from femoreg_torch.volume.segments import segment_names

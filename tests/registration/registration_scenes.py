@@ -14,8 +14,8 @@ from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, CArm, Poses, about_point, centred_camera, exp_se3, rigid, rotation_angle
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration import OrbitSearch, Plan, Stage, Step
-from femoreg_torch.registration.calibration import Calibration
 from femoreg_torch.registration.imaging import PLAIN, draw_still
+from femoreg_torch.registration.materials.calibration import Calibration
 from femoreg_torch.registration.scene import Kind, RigidObject, Scene, Segmentation
 from femoreg_torch.registration.turn_search import TurnSearch
 from femoreg_torch.volume import Volume, axis_aligned

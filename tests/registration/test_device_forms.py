@@ -18,8 +18,8 @@ from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import CArm, centred_camera
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, run_plan
-from femoreg_torch.registration.models import model_attenuation
-from femoreg_torch.registration.prepare import prepare_scene
+from femoreg_torch.registration.prepare.models import model_attenuation
+from femoreg_torch.registration.prepare.scene import prepare_scene
 from femoreg_torch.registration.scene import RigidObject
 from femoreg_torch.registration.stage import run_stage
 from femoreg_torch.similarity import GradNcc

@@ -11,8 +11,8 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import CameraChange, Poses, Uncertainty, about_point, exp_se3, rigid
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic
-from femoreg_torch.registration.covariance import pose_covariance
-from femoreg_torch.registration.doubts import doubts_about_the_carm
+from femoreg_torch.registration.doubts.carm import doubts_about_the_carm
+from femoreg_torch.registration.evidence.covariance import pose_covariance
 from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, doubted, doubts
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, image_quadratic, stage_objective

@@ -37,16 +37,16 @@ from femoreg_torch.drr import chosen_device
 from femoreg_torch.geometry import centred_camera, first_view_only
 from femoreg_torch.optimize import LevenbergMarquardt, SmoothObjective
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, run_plan
-from femoreg_torch.registration.calibration import Calibration
-from femoreg_torch.registration.device_doubts import doubts_about_the_models
-from femoreg_torch.registration.handedness import handedness
+from femoreg_torch.registration.doubts.device import doubts_about_the_models
+from femoreg_torch.registration.evidence.handedness import handedness
+from femoreg_torch.registration.evidence.rigidity import bend, images_of
 from femoreg_torch.registration.imaging import PLAIN, Imaging
+from femoreg_torch.registration.materials.calibration import Calibration
 from femoreg_torch.registration.objective import image_costs, stage_objective
 from femoreg_torch.registration.quality import Limits, assess, final_covariance
-from femoreg_torch.registration.rigidity import bend, images_of
 from femoreg_torch.registration.scene import Body, Moving, Outline, intrinsics_of, reference_point_in_view
-from femoreg_torch.registration.silhouette import refine_by_silhouette
 from femoreg_torch.registration.stage import run_stage
+from femoreg_torch.registration.start.silhouette import refine_by_silhouette
 from femoreg_torch.similarity import GradientOrientation, GradNcc, Ncc, Similarity
 from sim.physics.fluoroscopy import fluoroscopy
 from sim.theatre.posed_tissue import PosedTissue, areal_posed_tissue

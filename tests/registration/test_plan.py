@@ -11,8 +11,8 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import load_carm
 from femoreg_torch.optimize import Bobyqa, CmaEs, LevenbergMarquardt
 from femoreg_torch.registration import BodyPlan, OrbitSearch, Stage, load_plan, plan_from
-from femoreg_torch.registration.calibration import Calibration
 from femoreg_torch.registration.level import Level, binning
+from femoreg_torch.registration.materials.calibration import Calibration
 from femoreg_torch.similarity import GradNcc, Ncc
 
 STAGE = {

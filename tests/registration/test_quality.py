@@ -14,12 +14,12 @@ from femoreg_torch.case.quality import ViewQuality
 from femoreg_torch.case.trace import Restart, StageRecord
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
+from femoreg_torch.registration.evidence.turns import losses_by_turning
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.quality import Limits, _Judged, _reason, _unsettled, _unturned, _vague, assess
 from femoreg_torch.registration.run import _started_at
 from femoreg_torch.registration.scene import RigidObject, Scene
-from femoreg_torch.registration.turns import losses_by_turning
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume, axis_aligned
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from femoreg_torch.case import Case, CaseObject, Model, Start, View
 from femoreg_torch.fluoro import write_image
 from femoreg_torch.geometry import Poses, exp_so3
-from femoreg_torch.registration.covariance import IntrinsicsEstimate, PoseCovariance
-from femoreg_torch.registration.prepare import prepare_scene
+from femoreg_torch.registration.evidence.covariance import IntrinsicsEstimate, PoseCovariance
+from femoreg_torch.registration.prepare.scene import prepare_scene
 from femoreg_torch.registration.quality import _Judged
 from femoreg_torch.registration.roundness import Axis, round_axis
 from femoreg_torch.volume import Volume, axis_aligned

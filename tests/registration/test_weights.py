@@ -24,7 +24,7 @@ from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_costs, stage_objective
 from femoreg_torch.registration.scene import Body, Scene, Segmentation, moved
-from femoreg_torch.registration.start import with_segmentations
+from femoreg_torch.registration.start.find import with_segmentations
 from femoreg_torch.registration.weights import Weighting, believed, pixel_weights
 from femoreg_torch.similarity import GradNcc
 

@@ -7,7 +7,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from femoreg_torch.registration.models import told_of_end, told_of_middle
+from femoreg_torch.registration.prepare.models import told_of_end, told_of_middle
 from femoreg_torch.volume import Volume, guide_end, voxelise_mesh
 
 TIP, BASE = torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 100.0], dtype=torch.float64)

@@ -1,0 +1,120 @@
+"""Anatomy and devices that moved between the images, in words."""
+
+from femoreg_torch.registration.evidence.covariance import PoseCovariance
+from femoreg_torch.registration.evidence.motion import GuideDrift, JointTurn, MotionBetween
+
+# Of the anatomy between images without and with the device. Seen in all views together where nothing had moved,
+# whatever else was wrong: at most 0.1 mm, 0.2° and 1.6 deviations; in one view by itself 0.4 mm, 0.1° and 2.8. Where a
+# patient had moved by 1 mm and 1°: 0.9 to 1.1°, and 10 to 12 deviations; where a leg had turned by 2°, on images of
+# another simulator with more noise: 1.8° and 2.4 deviations (five right ones of it: at most 1.1). Of similarity moving
+# gained 0.006 to 0.15 in five more; of six right ones at most 0.0007, where one seemed 1.6 mm off by 3.2 deviations.
+_GAIN_OF_MOTION = 0.001
+_MOST_MOTION_MM, _MOST_MOTION_DEG, _SURE_OF_MOTION, _SURE_IN_ALL = 0.3, 0.3, 3.0, 2.2
+# Of a device in one view, beside the others: what its moving gains of similarity. Where it was held still: at most
+# 0.0004, on images of other simulators 0.0015 and 2.2 deviations, 0.0018 and 2.9, 0.0009 and 3.2 (one whose device was
+# another: 0.0011 and 3.3). Where it moved by 1.2 mm and 0.8° between the views: 0.0014 to 0.0057, in all of eight at
+# least 3.4 deviations; on images of another simulator 0.0031 and 2.4.
+_GAIN_OF_DRIFT, _GAIN_OF_SURE_DRIFT = 0.002, 0.001
+# Of a tool along and about its guide in one view alone. Of 39 right ones of three simulators slides were at most 0.3 mm
+# and gained 0.00015; turns at most 0.8°, and 2.5° where they gained less than 0.00005. Slides of 1 and 1.5 mm were
+# measured as 0.7 to 1.4 mm, by 5 deviations and more, and gained 0.0016; turns of 4 to 8° as 2.5 to 5°, by 1.5 to 2.9
+# deviations, and gained 0.0005.
+_MOST_SLIDE_MM, _SURE_OF_SLIDE, _GAIN_OF_SLIDE = 0.6, 3.0, 0.0003
+_MOST_TURN_DEG, _SURE_OF_TURN, _GAIN_OF_TURN = 2.0, 1.2, 0.0003
+# Of a bone in one view, beside the others. Where a leg had turned by 1.8° from view to view: 0.018, and where a neck
+# had broken 0.0029 and more. Of 16 right ones of two simulators, with bad CTs, shutters and metal too: at most 0.0007,
+# of nine of a third at most 0.0029.
+_GAIN_OF_BONE_DRIFT = 0.004
+# Of a bone that turns in its joint in one view. Where a leg had turned by 1.5, 2 and 2.5° in one view of another
+# simulator: 1.3, 2.0 and 2.3°, by 4.7, 3.7 and 4.8 deviations, with gains of 0.0013, 0.0018 and 0.0036. Of 15 right
+# ones of two simulators: up to 1.4°, but by 3 deviations at most (0.6°), with gains of 0.0009 at most.
+_MOST_JOINT_TURN_DEG, _SURE_OF_JOINT_TURN, _GAIN_OF_JOINT_TURN = 0.8, 3.0, 0.0009
+
+
+def doubts_about_motion(covariance: PoseCovariance, *, given: bool = False) -> tuple[str, ...]:
+    """Anatomy that lies elsewhere in images of another kind, or a device that moved between the views, in words.
+
+    Where the poses of the C-arm were `given`, these may be off as well.
+
+    Where both explain the images, what explains them better. A single bone or device counts if it is sure by itself:
+    the depth of a bone in one view is so open that it may gain more where a device has moved.
+    """
+    moved = [each for each in covariance.drifts if _has_drifted(each)]
+    if any(_has_moved(each) for each in covariance.motions):
+        moved.append(max(covariance.motions, key=lambda each: each.gain))
+    if not moved:
+        return doubts_about_joints(covariance) or doubts_about_guides(covariance)
+    or_given = ", or the poses that the case gives (`camera_from_camera1`) are off" if given else ""
+    found = max(moved, key=lambda each: each.gain)
+    deg, mm = found.size
+    view = f" of view {found.views[0] + 1}"
+    if found in covariance.drifts and found.kind is None:
+        return (
+            f"in view {found.views[0] + 1}, the {found.objects[0]} lies {mm:.1f} mm and {deg:.1f}° from where the "
+            f"other views show it: it has moved between the views (a leg that turned?){or_given}; take them again, or, "
+            "if nothing has moved, check the size of pixels and voxels, and that the bone is whole",
+        )
+    if found in covariance.drifts:
+        return (
+            f"in the {found.kind} image{view}, the {found.objects[0]} lies elsewhere than in those of the other views: "
+            f"it has moved between the views, or the C-arm's distance or pixels differ in that view{or_given}; hold it "
+            "still and take them again",
+        )
+    where = "" if len(found.views) > 1 else view
+    who = "the patient or the C-arm" if where or len(found.objects) > 1 else f"the {found.objects[0]}"
+    lies = " and ".join(found.objects)
+    return (
+        f"in the {found.kind} images{where}, {lies} lie{'s' if len(found.objects) == 1 else ''} {mm:.1f} mm and "
+        f"{deg:.1f}° from where the other images show them: {who} has moved between the images{or_given}; take them "
+        "again",
+    )
+
+
+def doubts_about_joints(covariance: PoseCovariance) -> tuple[str, ...]:
+    """A leg that turned in its joint in one view, in words: what explains the images best."""
+    moved = [each for each in covariance.joint_turns if _has_turned(each)]
+    if not moved:
+        return ()
+    found = max(moved, key=lambda each: each.gain)
+    return (
+        f"in view {found.view + 1}, the {found.name} is turned by {found.degrees:.1f}° in its joint from where the "
+        "other views show it: the leg has turned between the views; hold it still and take them again",
+    )
+
+
+def doubts_about_guides(covariance: PoseCovariance) -> tuple[str, ...]:
+    """A tool that slid along its guide or turned about it in one view, in words: what explains the images best."""
+    moved = [each for each in covariance.guide_drifts if _has_drifted_along(each)]
+    if not moved:
+        return ()
+    found = max(moved, key=lambda each: each.gain)
+    how = "is turned by {:.0f}° about its guide" if found.turns else "lies {:.1f} mm along its guide"
+    return (
+        f"in the {found.kind} image of view {found.view + 1}, the {found.name} {how.format(abs(found.amount))} from "
+        "where the other views show it: it has moved between the views; hold it still and take them again",
+    )
+
+
+def _has_moved(found: MotionBetween) -> bool:
+    sure = _SURE_IN_ALL if len(found.views) > 1 else _SURE_OF_MOTION
+    far = found.size[0] > _MOST_MOTION_DEG or found.size[1] > _MOST_MOTION_MM
+    return far and found.sureness > sure and found.gain > _GAIN_OF_MOTION
+
+
+def _has_drifted(found: MotionBetween) -> bool:
+    if found.kind is None:
+        return found.gain > _GAIN_OF_BONE_DRIFT
+    return found.gain > _GAIN_OF_DRIFT or (found.gain > _GAIN_OF_SURE_DRIFT and found.sureness > _SURE_OF_MOTION)
+
+
+def _has_turned(found: JointTurn) -> bool:
+    told = found.degrees > _MOST_JOINT_TURN_DEG and found.sureness > _SURE_OF_JOINT_TURN
+    return told and found.gain > _GAIN_OF_JOINT_TURN
+
+
+def _has_drifted_along(found: GuideDrift) -> bool:
+    if found.turns:
+        most, sure, gain = _MOST_TURN_DEG, _SURE_OF_TURN, _GAIN_OF_TURN
+    else:
+        most, sure, gain = _MOST_SLIDE_MM, _SURE_OF_SLIDE, _GAIN_OF_SLIDE
+    return abs(found.amount) > most and found.sureness > sure and found.gain > gain

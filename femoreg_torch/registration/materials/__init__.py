@@ -1,0 +1,1 @@
+"""What a device is made of, estimated from the images."""
