@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from femoreg_torch.fluoro.intensity import downsample
-from femoreg_torch.geometry import Camera
+from femoreg_torch.geometry import Camera, circle_through
 
 MARGIN_MM = 2.5  # on the detector, from the edge: the penumbra of a focal spot of 0.6 mm
 _PIXEL_MM = 1.0  # that edges are looked for on
@@ -429,8 +429,5 @@ def _line_of(points: Array) -> _Line:
 
 
 def _circle_of(points: Array) -> _Circle:
-    """The circle through points (N, 2), by algebraic least squares."""
-    origin = points.mean(0)
-    moved = points - origin
-    unknowns = np.linalg.lstsq(np.c_[2 * moved, np.ones(len(points))], (moved**2).sum(1), rcond=None)[0]
-    return _Circle(unknowns[:2] + origin, float(np.sqrt(max(unknowns[2] + unknowns[:2] @ unknowns[:2], 0.0))))
+    """The circle through points (N, 2)."""
+    return _Circle(*circle_through(points))

@@ -2,6 +2,7 @@
 
 from femoreg_torch.geometry.camera import Camera, CameraChange, centred_camera, project_points
 from femoreg_torch.geometry.carm import CArm, Uncertainty, carm_from_dict, load_carm, orbit_angles
+from femoreg_torch.geometry.circle import circle_through
 from femoreg_torch.geometry.itk_files import read_itk_transform
 from femoreg_torch.geometry.poses import Poses, first_view_only, poses_by_object
 from femoreg_torch.geometry.rigid import (
@@ -30,6 +31,7 @@ __all__ = [
     "carm_from_dict",
     "centred_camera",
     "check_rigid",
+    "circle_through",
     "euler_xyz_deg",
     "exp_se3",
     "exp_so3",

@@ -268,17 +268,22 @@ def motions(bodies: Sequence[Body], deltas: Sequence[Tensor]) -> list[Tensor]:
 def in_view(scene: Scene, poses: Poses, name: str, points: Tensor) -> Tensor:
     """Which points (N, 3) of an object, mm in its space, some image that holds it shows in its exposed field: (N,)."""
     seen = torch.zeros(len(points), dtype=torch.bool)
-    for kind, view in scene.there(scene.objects[name].shown_in, range(scene.views)):
-        camera = scene.camera(poses, view)
-        pixels = project_points(camera, transform_points(poses.camera_from(name)[view], points)).round().long()
-        size = torch.tensor(camera.shape[::-1])
-        inside = ((pixels >= 0) & (pixels < size)).all(1)
-        field = scene.field(kind, view)
-        if field is not None:
-            column, row = pixels.clamp_min(0).minimum(size - 1).unbind(1)
-            inside &= field.cpu()[row, column]
-        seen |= inside
+    for image in scene.there(scene.objects[name].shown_in, range(scene.views)):
+        seen |= shown_by(scene, poses, name, image, points)
     return seen
+
+
+def shown_by(scene: Scene, poses: Poses, name: str, image: tuple[Kind, int], points: Tensor) -> Tensor:
+    """Which points (N, 3) of an object, mm in its space, an image (kind, view) shows in its exposed field: (N,)."""
+    kind, view = image
+    camera, field = scene.camera(poses, view), scene.field(kind, view)
+    pixels = project_points(camera, transform_points(poses.camera_from(name)[view], points)).round().long()
+    size = torch.tensor(camera.shape[::-1])
+    inside = ((pixels >= 0) & (pixels < size)).all(1)
+    if field is None:
+        return inside
+    column, row = pixels.clamp_min(0).minimum(size - 1).unbind(1)
+    return inside & field.cpu()[row, column]
 
 
 def reference_point_in_view(scene: Scene, poses: Poses, name: str, view: int) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import transform_points
 
 # Edges of voxels and places, mm. Far beyond what is scanned, and so that indices and mm can be told in float64.
 _VOXEL_MM = (1e-6, 1e6)
@@ -59,6 +60,12 @@ class Volume:
         half = torch.tensor(self.data.shape[::-1]) * spacing / 2
         along = (self.lps_from_index[:3, :3] / spacing).T @ (point - self.centre())
         return (along.abs() - half).clamp_min(0).norm().item()
+
+    def points_above(self, least: float, most: int) -> Tensor:
+        """Centres (N, 3) of voxels with more than `least`, mm, on the CPU: every n-th, so that at most `most`."""
+        places = (self.data > least).nonzero()
+        places = places[:: 1 + len(places) // most].cpu()
+        return transform_points(self.lps_from_index, places.flip(1).double())
 
     def with_data(self, data: Tensor) -> "Volume":
         """Other values (Z, Y, X) on the same grid. Raises `InputError` for another shape."""

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
+from femoreg_torch.geometry import circle_through
 from femoreg_torch.volume.grid import Volume
 
 _LEAST_EDGE = 40  # voxels of a slice along the edge; of fewer nothing is said
@@ -45,16 +45,9 @@ def round_field(ct: Volume) -> RoundField | None:
     off_mm = _OFF * max(ct.spacing_mm[:2])
     near = np.ones(len(places), bool)
     for _ in range(_REFITS):
-        x, y, radius = _circle(places[near])
+        (x, y), radius = circle_through(places[near])
         off = np.abs(np.hypot(*(places - (x, y)).T) - radius)
         near = off <= max(off_mm, float(np.median(off)))
     if not (off <= off_mm).mean() >= _ON_IT:
         return None
-    return RoundField((float(x), float(y)), float(radius))
-
-
-def _circle(points: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Algebraic least-squares circle through points (N, 2): middle and radius."""
-    solution = np.linalg.lstsq(np.c_[2 * points, np.ones(len(points))], (points**2).sum(1), rcond=None)[0]
-    x, y = solution[:2]
-    return x, y, np.sqrt(max(0.0, solution[2] + x**2 + y**2))
+    return RoundField((float(x), float(y)), radius)

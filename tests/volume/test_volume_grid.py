@@ -65,3 +65,15 @@ def test_turned_sheared_mirrored_and_rounded_grids_are_grids() -> None:
     sheared = torch.tensor([[0.5, 0.2, 0, 7], [0, -0.6, 0.4, 8], [0.1, 0, 3, 9], [0, 0, 1e-16, 1]], dtype=torch.float64)
     for affine in (sheared, axis_aligned((1e-3, 1e-3, 1e-3), (0, 0, 0)), axis_aligned((500, 500, 500), (0, 0, 0))):
         assert Volume(torch.zeros(3, 4, 5), affine).lps_from_index is affine
+
+
+def test_points_above_a_value_are_the_centres_of_their_voxels_and_never_too_many() -> None:
+    data = torch.zeros(3, 4, 5)
+    data[1, 2, 3], data[2, 0, 0] = 2.0, 1.0
+    affine = axis_aligned((1.0, 2.0, 3.0), (10.0, 20.0, 30.0))
+    volume = Volume(data, affine)
+    assert volume.points_above(1.0, 10).tolist() == [[13.0, 24.0, 33.0]]
+    assert volume.points_above(0.5, 10).tolist() == [[13.0, 24.0, 33.0], [10.0, 20.0, 36.0]]
+    assert len(volume.points_above(5.0, 10)) == 0
+    for most in (1, 7, 30, 60, 100):
+        assert 0 < len(Volume(torch.ones(3, 4, 5), affine).points_above(0.5, most)) <= most

@@ -38,6 +38,7 @@ _INSIDE = 0.2  # of the greatest attenuation: what counts as the device
 _MOST_POINTS = 5_000
 _NEAREST_MM, _FARTHEST_MM, _STEP_MM = 4.0, 24.0, 2.0  # along both axes across the device: where another is looked for
 _STARTS = 5
+_ALONG_THE_BEAM = 0.95  # cosine: of a device that lies so, another axis of camera 1 stands for the beam
 # Stopped after 15 iterations, one on its way back to the device was 4 mm beside it, and told as a rival.
 _OPTIMISER = LevenbergMarquardt(max_iterations=30, tol_x=0.02, tol_f=1e-5)
 _SCALE = (0.03, 0.03, 0.03, 1.0, 1.0, 3.0)  # rad and mm: one unit of a motion
@@ -125,12 +126,11 @@ def rival(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -
     over itself. None where none of the best few starts ends elsewhere, or nothing is exposed.
     """
     thing, pose = scene.objects[name], poses.camera1_from[name]
-    filled = (thing.volume.data > _INSIDE * thing.volume.data.max()).nonzero().cpu()
-    filled = filled[:: 1 + len(filled) // _MOST_POINTS].flip(1).double()
-    points = transform_points(pose @ thing.volume.lps_from_index, filled)
+    filled = thing.volume.points_above(_INSIDE * float(thing.volume.data.max()), _MOST_POINTS)
+    points = transform_points(pose, filled)
     away = points - points.mean(0)
     moments, axes = torch.linalg.eigh(away.T @ away / len(points))  # the last is long
-    apart = max(_APART_MM, math.sqrt(moments[1]))
+    apart, across = max(_APART_MM, math.sqrt(moments[1])), _across(axes[:, 2])
     centre, scale = reference_point_in_view(scene, poses, name, 0), torch.tensor(_SCALE, dtype=torch.float64)
     body = Body((name,), 0, centre, scale)
     images = scene.there([kind], range(scene.views))
@@ -142,19 +142,30 @@ def rival(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -
     without = costs.without_what_moves()
     gains = without - costs(costs.still[None])[0]
     found: list[Rival] = []
-    for place in _lowest(lambda deltas: costs(deltas).mean(1), axes[:, :2], scale):
+    for place in _lowest(lambda deltas: costs(deltas).mean(1), across, scale):
         start = torch.zeros(6, dtype=torch.float64)
-        start[3:] = axes[:, :2] @ place / scale[3:]
+        start[3:] = across @ place / scale[3:]
         begun = moved(poses, (body,), start)
         again = Body((name,), 0, reference_point_in_view(scene, begun, name, 0), scale)
         there = image_costs(scene, begun, (again,), names, images, _LEVEL, _SIMILARITY, imaging=imaging)
         result = _OPTIMISER.minimise(stage_objective(there, (again,), None), 6, seed=0)
         ended = moved(begun, (again,), result.delta).camera1_from[name]
-        moved_by = transform_points(ended @ thing.volume.lps_from_index, filled).mean(0) - points.mean(0)
-        across = float((moved_by @ axes[:, :2]).norm())
-        if across > apart:
-            found.append(Rival(across, _share(without - there(result.delta[None])[0], gains)))
+        moved_by = transform_points(ended, filled).mean(0) - points.mean(0)
+        beside = float((moved_by @ across).norm())
+        if beside > apart:
+            found.append(Rival(beside, _share(without - there(result.delta[None])[0], gains)))
     return max(found, key=lambda each: each.share, default=None)
+
+
+def _across(long: Tensor) -> Tensor:
+    """Two directions (3, 2) across a device, by where its long axis (3,) lies in camera 1: the first across the beam.
+
+    The device's own axes are no help: those across a square or a round one are any, by rounding.
+    """
+    beam = torch.tensor([0.0, 0.0, 1.0] if abs(long[2]) < _ALONG_THE_BEAM else [1.0, 0.0, 0.0], dtype=torch.float64)
+    first = torch.linalg.cross(long, beam)
+    first = first / first.norm()
+    return torch.stack([first, torch.linalg.cross(long, first)], 1)
 
 
 def _share(elsewhere: Tensor, here: Tensor) -> float:

@@ -19,14 +19,14 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.geometry import Poses, log_so3, project_points, transform_points
+from femoreg_torch.geometry import Poses, log_so3, transform_points
 from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective
 from femoreg_torch.registration.evidence.turns import TOLD, long_axis
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import ImageCosts, image_costs, image_quadratic, stage_objective
-from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene, moved
+from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene, moved, shown_by
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume
 
@@ -230,9 +230,8 @@ def _shown_in(scene: Scene, name: str) -> list[tuple[Kind, int]]:
 def _ends(scene: Scene, poses: Poses, name: str, share: float, images: Sequence[tuple[Kind, int]]) -> _Ends | None:
     thing = scene.objects[name]
     volume, data = thing.volume, thing.volume.data
-    filled = (data > _INSIDE * data.max()).nonzero().cpu()
-    points = transform_points(volume.lps_from_index, filled[:: 1 + len(filled) // _MOST_POINTS].flip(1).double())
-    times = torch.stack([_seen(scene, poses, name, image, points) for image in images]).sum(0)
+    points = volume.points_above(_INSIDE * float(data.max()), _MOST_POINTS)
+    times = torch.stack([shown_by(scene, poses, name, image, points) for image in images]).sum(0)
     points = points[times >= min(2, len(images))]
     least = max(_LEAST_POINTS, round(_LEAST_SHARE * len(points)))
     if len(points) < 2 * least:
@@ -253,17 +252,6 @@ def _ends(scene: Scene, poses: Poses, name: str, share: float, images: Sequence[
     )
     near = (along - place).abs().argsort()[:least]
     return _Ends((one, other), both, points[near].mean(0))
-
-
-def _seen(scene: Scene, poses: Poses, name: str, image: tuple[Kind, int], points: Tensor) -> Tensor:
-    """Which points (N, 3) of an object lie on the exposed part of the detector in an image."""
-    camera, exposed = scene.camera(poses, image[1]), scene.field(*image)
-    pixels = project_points(camera, transform_points(poses.camera_from(name)[image[1]], points))
-    on_it = ((pixels > 0) & (pixels < pixels.new_tensor(camera.shape).flip(0) - 1)).all(-1)
-    if exposed is not None:
-        column, row = torch.where(on_it[:, None], pixels, 0).round().long().unbind(1)
-        on_it &= exposed.cpu()[row, column]
-    return on_it
 
 
 def _heights(volume: Volume, axis: Tensor) -> Tensor:

@@ -67,8 +67,5 @@ def long_axis(points: Tensor) -> Tensor:
 
 def _points_in_view(scene: Scene, poses: Poses, name: str) -> Tensor:
     """Filled voxels (N, 3) of an object, mm in camera 1, that an exposed pixel of some image shows."""
-    volume = scene.objects[name].volume
-    places = (volume.data > _FILLED).nonzero().cpu()
-    places = places[:: 1 + len(places) // _MOST_POINTS]
-    points = transform_points(volume.lps_from_index, places.flip(1).double())
+    points = scene.objects[name].volume.points_above(_FILLED, _MOST_POINTS)
     return transform_points(poses.camera1_from[name], points[in_view(scene, poses, name, points)])

@@ -12,7 +12,7 @@ from femoreg_torch.drr import project
 from femoreg_torch.geometry import Poses, centred_camera
 from femoreg_torch.registration import Scene
 from femoreg_torch.registration.doubts.device import doubts_beside_devices
-from femoreg_torch.registration.evidence.besides import _share, besides, rival
+from femoreg_torch.registration.evidence.besides import _across, _share, besides, rival
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.volume import Volume, axis_aligned
 
@@ -110,3 +110,10 @@ def test_what_explains_one_view_alone_is_no_rival() -> None:
     assert _share(0.8 * totals, totals) == pytest.approx(0.8)
     assert _share(totals[:1], totals[:1]) == pytest.approx(1)  # there is no other view to ask
     assert _share(torch.tensor([0.05, 0.01, 0.0]), torch.tensor([0.05, 0.0, 0.0])) == 0  # others show no device
+
+
+@pytest.mark.parametrize("long", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.6, 0.0, 0.8), (1.0, 0.0, 0.0)])
+def test_the_directions_across_a_device_are_square_to_it(long: tuple[float, float, float]) -> None:
+    axis = torch.tensor(long, dtype=torch.float64)
+    square = torch.cat([_across(axis), axis[:, None]], 1)
+    torch.testing.assert_close(square.T @ square, torch.eye(3, dtype=torch.float64))
