@@ -9,13 +9,11 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import transform_points
-from femoreg_torch.segment.rules import SIDES, femoral_head
+from femoreg_torch.segment.rules import DOUBTED_RESIDUAL_MM, HEAD_RADIUS_MM, SIDES, femoral_head
 from femoreg_torch.segment.sphere import stretch_along
 from femoreg_torch.segment.surface import bone_surface
 from femoreg_torch.volume import BoneLabels, Volume, crop
 
-HEAD_RADIUS_MM = (15.0, 35.0)  # of what may be a femoral head at all; other spheres are none
-DOUBTED_RESIDUAL_MM = 1.5
 _NEAR_MM = 40.0  # of a landmark in the head, to each side: a head has 32 mm, and the landmark may be some mm off
 # Of adults. Diameters of 170 femora: men 49 ± 3 mm, women 44 ± 3 mm (Mall et al., Forensic Science International 113
 # (2000) 315); Thai women 40 mm in the mean (Saengnipanthkul and Techasatien, J Med Assoc Thai 95 (2012) 790). 34 and

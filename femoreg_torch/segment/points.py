@@ -9,8 +9,8 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
-from femoreg_torch.segment.heads import DOUBTED_RESIDUAL_MM, HEAD_RADIUS_MM, doubted_radius
-from femoreg_torch.segment.rules import SIDES, find_surface_landmarks
+from femoreg_torch.segment.heads import doubted_radius
+from femoreg_torch.segment.rules import DOUBTED_RESIDUAL_MM, HEAD_RADIUS_MM, SIDES, find_surface_landmarks
 from femoreg_torch.segment.surface import STEP_MM, bone_surface
 from femoreg_torch.volume import BoneLabels, Volume
 from femoreg_torch.volume.round_field import RoundField, round_field

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.errors import InputError
 from femoreg_torch.segment.silhouettes import convex_hull, largest_hole, silhouette, vertex_behind
-from femoreg_torch.segment.sphere import refitted_sphere
+from femoreg_torch.segment.sphere import most_supported_sphere, refitted_sphere
 
 Points = NDArray[np.float64]
 Surfaces = dict[str, trimesh.Trimesh]
@@ -27,6 +27,9 @@ SIDES = {"left": 1, "right": -1}  # the sign of x
 
 _SEARCH_PIXEL_MM = 1.0  # for finding the direction of the view
 _PIXEL_MM = 0.5
+HEAD_RADIUS_MM = (15.0, 35.0)  # of what may be a femoral head at all; other spheres are none
+DOUBTED_RESIDUAL_MM = 1.5  # of a head's surface from its sphere
+_ABOUT_MM = 10.0  # beyond a head's sphere: what lies further off belongs to another part of the femur
 _HEADS_APART_MM = 50.0  # centres of the femoral heads; some 170 in adults
 _HALF_HEADS_MM = 88.0  # half the distance of the femoral heads of adults
 
@@ -87,13 +90,22 @@ def find_surface_landmarks(bones: Surfaces, whole: bool = True, edge_mm: float =
 def femoral_head(femur: trimesh.Trimesh, hip: trimesh.Trimesh) -> tuple[Points, float]:
     """Centre and radius (4,): fitted to the vertices next to the hip bone, then again to those near the sphere.
 
-    Also the root mean square distance from it of the vertices next to the hip bone.
+    Where these do not lie on that sphere, as of a femur that comes near the ischium too, the best of many spheres
+    through four of them each is taken. Also the root mean square distance from the sphere of those about it.
     """
     gap = cKDTree(hip.vertices).query(femur.vertices)[0]
     socket = gap < np.percentile(gap, 2) + 3
     sphere = refitted_sphere(femur.vertices, socket)
-    off = np.linalg.norm(femur.vertices[socket] - sphere[:3], axis=1) - sphere[3]
-    return sphere, float(np.sqrt((off**2).mean()))
+    if _residual(sphere, femur.vertices[socket]) > DOUBTED_RESIDUAL_MM:
+        sphere = most_supported_sphere(femur.vertices, socket, HEAD_RADIUS_MM, sphere)
+    return sphere, _residual(sphere, femur.vertices[socket])
+
+
+def _residual(sphere: Points, points: Points) -> float:
+    """Root mean square distance from a sphere (4,) of points (N, 3) in and about it; of all, where none is."""
+    off = np.linalg.norm(points - sphere[:3], axis=1) - sphere[3]
+    about = off < _ABOUT_MM
+    return float(np.sqrt((off[about if about.any() else slice(None)] ** 2).mean()))
 
 
 def _pelvic_frame(hips: Surfaces, heads: dict[str, Points]) -> tuple[Points, Points, dict[str, Points]]:

@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from hip_scenes import HEAD, RADIUS_MM, answering, hip_scene, shares_of
 
 from femoreg_torch.commands.main import main
 from femoreg_torch.intake.planes import planes_through_joints
 from femoreg_torch.segment.heads import Head, doubted_slices, fitted_heads
-from femoreg_torch.segment.sphere import stretch_along
+from femoreg_torch.segment.rules import femoral_head
+from femoreg_torch.segment.sphere import most_supported_sphere, stretch_along
 from femoreg_torch.volume import Volume, axis_aligned, write_volume
 
 SPACING = 1.5
@@ -57,6 +59,30 @@ def test_a_head_without_its_socket_is_not_looked_for() -> None:
     assert fitted_heads(labels, {"femur_left": 5}) == {}
     (head,) = fitted_heads(labels, {"femur_left": 5, "hip_left": 1}).values()
     np.testing.assert_allclose(head.centre, HEAD, atol=0.5)
+
+
+def test_a_head_is_found_where_the_femur_comes_near_the_ischium_too() -> None:
+    """The lesser trochanter, 60 mm below the head, lies nearer to the hip bone than the head does."""
+    head, socket = (trimesh.creation.icosphere(4, radius) for radius in (22.0, 26.0))
+    socket.update_faces(socket.triangles_center[:, 2] > 5)
+    socket.remove_unreferenced_vertices()
+    shaft = trimesh.creation.cylinder(14.0, 90.0, transform=trimesh.transformations.translation_matrix([30, 0, -70]))
+    shaft = shaft.subdivide_to_size(4.0)
+    ischium = trimesh.creation.icosphere(3, 12.0).apply_translation([5, 0, -70])  # 1 mm from the shaft
+    femur = trimesh.util.concatenate([head, shaft])
+    sphere, residual = femoral_head(femur, trimesh.util.concatenate([socket, ischium]))
+    np.testing.assert_allclose(sphere, [0, 0, 0, 22], atol=0.2)
+    assert residual < 0.5
+
+
+def test_the_known_sphere_stays_where_no_other_holds_more_points() -> None:
+    generator = np.random.default_rng(3)
+    ball = generator.normal(size=(500, 3))
+    ball *= 23 / np.linalg.norm(ball, axis=1, keepdims=True)
+    known = np.array([0.01, 0.0, 0.0, 23.0])
+    np.testing.assert_allclose(most_supported_sphere(ball, np.ones(500, bool), (15, 35), known), known, atol=0.02)
+    flat = np.c_[generator.uniform(-20, 20, (200, 2)), np.zeros(200)]  # no sphere goes through a plane
+    assert most_supported_sphere(flat, np.ones(200, bool), (15, 35), known) is known
 
 
 @pytest.mark.parametrize("stretch", [0.85, 1.0, 1.12])
