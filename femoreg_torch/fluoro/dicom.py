@@ -18,7 +18,7 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro.suffixes import ITK_SUFFIXES, PICTURE_SUFFIXES, SCREEN_SUFFIXES
 from femoreg_torch.fluoro.tags import Tags, find_value, read_tags, value_in
 from femoreg_torch.paths import check_readable
-from femoreg_torch.volume.dicom import damaged_header, is_dicom
+from femoreg_torch.volume.dicom.headers import damaged_header, is_dicom
 
 Frames = tuple[int, ...] | Literal["mean"]  # of a cine run: numbers from 1, averaged, or all of them
 Values = NDArray[Any]

@@ -26,7 +26,7 @@ from femoreg_torch.geometry import Camera
 from femoreg_torch.paths import check_readable
 from femoreg_torch.pictures import write_picture
 from femoreg_torch.text import read_bytes
-from femoreg_torch.volume.dicom import is_dicom
+from femoreg_torch.volume.dicom.headers import is_dicom
 from femoreg_torch.volume.itk import read_itk
 
 _PAGED_SUFFIXES = (".tif", ".tiff")

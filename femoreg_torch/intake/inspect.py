@@ -35,7 +35,8 @@ from femoreg_torch.volume import (
     segment_names,
 )
 from femoreg_torch.volume.borders import cut_bones
-from femoreg_torch.volume.dicom import damaged_header, is_dicom, series_in
+from femoreg_torch.volume.dicom.headers import damaged_header, is_dicom
+from femoreg_torch.volume.dicom.series import series_in
 from femoreg_torch.volume.mesh_files import bounds_of
 from femoreg_torch.volume.segments import SEGMENTATION_SUFFIX
 

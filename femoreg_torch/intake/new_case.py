@@ -58,7 +58,7 @@ from femoreg_torch.volume import (
     write_volume,
 )
 from femoreg_torch.volume.bones import nearest_label
-from femoreg_torch.volume.dicom import is_dicom
+from femoreg_torch.volume.dicom.headers import is_dicom
 from femoreg_torch.volume.itk import DETACHED, read_itk
 from femoreg_torch.volume.reading import write_image
 

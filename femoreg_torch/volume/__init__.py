@@ -4,7 +4,7 @@ from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenu
 from femoreg_torch.volume.bones import BoneLabels, bone_labels
 from femoreg_torch.volume.contradictions import densities, misplaced_labels, shifted_labels, soft_bones
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
-from femoreg_torch.volume.dicom import patient_of
+from femoreg_torch.volume.dicom.series import patient_of
 from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
 from femoreg_torch.volume.guide_end import GuideEnd, guide_end
 from femoreg_torch.volume.labels import label_box_centre, looked_up

@@ -1,9 +1,11 @@
 """Images of the formats that SimpleITK reads."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import SimpleITK as sitk
+from numpy.typing import NDArray
 
 from femoreg_torch.arrays import check_claim, quiet
 from femoreg_torch.errors import InputError
@@ -65,3 +67,13 @@ def _reader_of(path: Path) -> str:
         f"{path}: a name that ends in {', '.join(s for suffixes in _READERS.values() for s in suffixes)} was expected, "
         "or a DICOM series. Save it in one of these formats."
     )
+
+
+def image_of(array: NDArray[Any], lps_from_index: NDArray[np.float64]) -> sitk.Image:
+    """A volume of highdicom, whose `array` is indexed as the columns of its affine are, as an image of SimpleITK."""
+    image = sitk.GetImageFromArray(np.ascontiguousarray(array.transpose(2, 1, 0)))
+    spacing = np.linalg.norm(lps_from_index[:3, :3], axis=0)
+    image.SetSpacing(spacing.tolist())
+    image.SetDirection((lps_from_index[:3, :3] / spacing).ravel().tolist())
+    image.SetOrigin(lps_from_index[:3, 3].tolist())
+    return image

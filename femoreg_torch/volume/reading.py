@@ -15,7 +15,9 @@ from femoreg_torch.errors import InputError, in_mm
 from femoreg_torch.files import temporary_file
 from femoreg_torch.geometry.rigid import FARTHEST_MM
 from femoreg_torch.paths import check_readable
-from femoreg_torch.volume.dicom import choose_series, is_dicom, read_series
+from femoreg_torch.volume.dicom.headers import is_dicom
+from femoreg_torch.volume.dicom.series import choose_series
+from femoreg_torch.volume.dicom.slices import read_series
 from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.itk import read_itk
 from femoreg_torch.volume.segments import has_names, read_segments

@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 from femoreg_torch.arrays import quiet
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.paths import check_readable
-from femoreg_torch.volume.dicom import image_of, is_dicom, series_in
-from femoreg_torch.volume.itk import read_itk
+from femoreg_torch.volume.dicom.headers import is_dicom
+from femoreg_torch.volume.dicom.series import series_in
+from femoreg_torch.volume.itk import image_of, read_itk
 from femoreg_torch.volume.text_headers import NRRD_SUFFIXES, check_text_header
 
 SEGMENTATION_SUFFIX = ".seg.nrrd"

@@ -35,7 +35,7 @@ from femoreg_torch.volume import (
     read_volume_told,
     segment_names,
 )
-from femoreg_torch.volume.dicom import series_in
+from femoreg_torch.volume.dicom.series import series_in
 
 SIZE = (7, 9, 8)  # slices, rows, columns
 PIXEL, STEP_MM = (0.9, 0.8), 2.5  # row spacing, column spacing

@@ -1,4 +1,4 @@
-"""CT from DICOM: the series of a folder, and one of them as a volume with its true geometry.
+"""A series of DICOM files as a volume with its true geometry.
 
 GDCM, in SimpleITK, decodes the pixels, compressed ones as well, and applies each slice's rescale. Where the slices lie
 is read here, from Image Position and Image Orientation (DICOM PS3.3, C.7.6.2), since ITK's reader of series passes over
@@ -6,26 +6,20 @@ missing slices, and over the shear of a tilted gantry.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
 
 import numpy as np
 import SimpleITK as sitk
 from numpy.typing import NDArray
 
-from femoreg_torch.arrays import opened
-from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.volume.patient import NOBODY, Patient, compared_text, patient_in
+from femoreg_torch.errors import InputError
+from femoreg_torch.volume.dicom.headers import Slice
+from femoreg_torch.volume.dicom.series import MOST_LISTED, Series
+from femoreg_torch.volume.itk import image_of
 
-_TAGS = (
-    "SOPInstanceUID", "SeriesInstanceUID", "SeriesNumber", "SeriesDescription", "Modality", "ImageType", "Rows",
-    "Columns", "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing", "NumberOfFrames", "AcquisitionNumber",
-    "RescaleSlope", "RescaleIntercept", "PhotometricInterpretation", "BitsStored", "HighBit", "PatientID",
-    "PatientName", "StudyInstanceUID", "FrameOfReferenceUID", "SliceThickness", "SpacingBetweenSlices",
-)  # fmt: skip
 # What all files of a series have in common (DICOM PS3.3, A.1.2), and what they are of by it.
 _IN_COMMON = {
     "PatientID": "patients",
@@ -33,222 +27,11 @@ _IN_COMMON = {
     "StudyInstanceUID": "studies",
     "FrameOfReferenceUID": "frames of reference",
 }
-_VOLUMES = ("CT", "MR", "PT", "NM", "OT")  # modalities whose series may be volumes; others are images, reports, masks
-_DEFLATED = "1.2.840.10008.1.2.1.99"  # transfer syntax
-_KINDS_OF_PIXELS = (b"OB", b"OW", b"OF", b"OD", b"UN")  # value representations of their element
-_UNDEFINED = 0xFFFFFFFF  # length of compressed pixels
 _AIR_HU = -1024.0  # what lies outside the slices of a tilted gantry
-_NOT_DICOM = {".gz", ".nii", ".nrrd", ".mha", ".mhd", ".json", ".txt", ".png", ".jpg", ".tif", ".tiff", ".zip", ".stl"}
-_MOST_LISTED = 12  # series in a message
 _SAME_PLACE_MM = 0.01  # slices that are closer are one
 _SHEAR_MM = 0.3  # of the last slice against the first: what rounding of positions and axes may make of it
 _ROUNDED_MM, _SAME_STEP = 0.03, 0.02  # of the step that a header tells: 0.625 mm may be written as 0.6
 _MOST_STEP = 1.25  # in thicknesses of a slice: those of a reconstruction without gaps touch or overlap
-
-
-@dataclass(frozen=True)
-class Slice:
-    """What the header of one DICOM file says."""
-
-    path: Path
-    header: Any  # pydicom.Dataset with some of `_TAGS`
-    holds_pixels: bool  # as many bytes of them as it claims
-
-    @property
-    def is_scout(self) -> bool:
-        """Whether it is a localiser, by ImageType (DICOM PS3.3, C.8.2.1)."""
-        return "LOCALIZER" in [str(word).upper() for word in self.header.get("ImageType") or []]
-
-    def numbers(self, name: str, count: int) -> NDArray[np.float64] | None:
-        """The `count` numbers of a tag, (count,); None where it is missing or holds something else."""
-        value = self.header.get(name)
-        try:
-            numbers = np.asarray(value, np.float64)
-        except (TypeError, ValueError):
-            return None
-        return numbers if numbers.shape == (count,) and np.isfinite(numbers).all() else None
-
-    def number(self, name: str) -> float | None:
-        """The finite number of a tag, or None where it is missing or holds something else."""
-        try:
-            value = float(self.header.get(name))
-        except (TypeError, ValueError):
-            return None
-        return value if np.isfinite(value) else None
-
-    def words(self, name: str) -> str:
-        """The text of a tag as it is compared; empty where it is missing."""
-        return compared_text(self.header, name)
-
-    def whole(self, name: str, otherwise: int) -> int:
-        """The whole number of a tag."""
-        try:
-            return int(self.header.get(name) or otherwise)
-        except (TypeError, ValueError):
-            return otherwise
-
-
-@dataclass(frozen=True)
-class Series:
-    """The files of one DICOM series."""
-
-    uid: str
-    slices: tuple[Slice, ...]
-    number: str = ""
-    description: str = ""
-    modality: str = ""
-
-    @property
-    def told(self) -> str:
-        """The series in a few words."""
-        named = f" “{self.description}”" if self.description else ""
-        return f"series {self.number or '?'}{named} ({self.modality or 'no modality'}, {len(self.slices)} files)"
-
-    @property
-    def may_be_volume(self) -> bool:
-        """Whether it may be a CT: several slices, or one file of several frames, and no scout.
-
-        Of a series that tells no modality, as some anonymisers leave it, slices with a place in the patient are taken.
-        """
-        first = self.slices[0]
-        frames = first.whole("NumberOfFrames", 1)
-        meant = self.modality.upper() in _VOLUMES or (not self.modality and "ImagePositionPatient" in first.header)
-        return meant and not first.is_scout and (len(self.slices) > 1 or frames > 1)
-
-
-def is_dicom(path: Path) -> bool:
-    """Whether a file is DICOM: by its preamble, or, without one, by a first element of the group 0002 or 0008."""
-    if not path.is_file() or path.suffix.lower() in _NOT_DICOM:
-        return False
-    with opened(path) as file:
-        head = file.read(132)
-    bare = len(head) == 132 and head[:2] in (b"\x02\x00", b"\x08\x00") and head[3:4] == b"\x00"
-    return head[128:] == b"DICM" or bare
-
-
-def series_in(folder: Path) -> list[Series]:
-    """All DICOM series in a folder and in the folders inside it, in order of their numbers.
-
-    A file that stands there twice, by its SOP Instance UID and its place, counts once. Images without a Series Instance
-    UID are taken for one series. A scout that bears the UID of the volume it was taken for is no part of it.
-    """
-    found: dict[str, dict[str, Slice]] = {}
-    for one in _headers(folder):
-        uid = str(one.header.get("SeriesInstanceUID") or "")
-        if uid or "Rows" in one.header:
-            name = one.header.get("SOPInstanceUID") or one.path
-            found.setdefault(uid, {}).setdefault(f"{name} {one.header.get('ImagePositionPatient')}", one)
-    series = []
-    for uid, files in found.items():
-        slices = [one for one in files.values() if not one.is_scout] or list(files.values())
-        first = slices[0].header
-        words = (str(first.get(tag) or "").strip() for tag in ("SeriesNumber", "SeriesDescription", "Modality"))
-        number, description, modality = words
-        series.append(Series(uid, tuple(slices), number, description, modality))
-    return sorted(series, key=lambda one: (not one.number.isdecimal(), one.number.zfill(9), one.uid))
-
-
-def _headers(folder: Path) -> Iterator[Slice]:
-    for path in sorted(folder.rglob("*")):
-        if path.name.upper() != "DICOMDIR" and is_dicom(path):
-            yield _slice(path)
-
-
-@contextmanager
-def damaged_header(path: Path) -> Iterator[None]:
-    """Whatever pydicom's reading of a header runs into is an `InputError` that names the file."""
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:  # pydicom's parsing raises whatever the bytes lead it to
-        raise InputError(
-            f"{path}: its DICOM header cannot be read ({shortened(error)}). Export it anew, or take the file away."
-        ) from error
-
-
-def _slice(path: Path) -> Slice:
-    """Some tags of a DICOM file. Raises `InputError`."""
-    import pydicom  # a fifth of a second, and most CTs are of other kinds
-
-    with damaged_header(path), path.open("rb") as file:
-        header = pydicom.dcmread(file, stop_before_pixels=True, force=True, specific_tags=list(_TAGS))
-        for tag in header.keys():  # noqa: SIM118  # a value is parsed when it is first asked for
-            header[tag]
-        return Slice(path, header, _holds_pixels(file, header, path.stat().st_size))
-
-
-def _holds_pixels(file: BinaryIO, header: Any, size: int) -> bool:
-    """Whether the bytes that the element of the pixels claims are there; the file, of that size, was read up to it.
-
-    GDCM believes a claim, and takes gigabytes of memory and half a minute for a broken file of some hundred bytes.
-    Layout of an element: DICOM PS3.5, chapter 7.1.
-    """
-    if str(getattr(header.file_meta, "TransferSyntaxUID", "")) == _DEFLATED:
-        return True  # its elements lie compressed in the file
-    implicit, little = header.original_encoding
-    element = file.read(12)
-    if len(element) < 12 or not (implicit or element[4:6] in _KINDS_OF_PIXELS):
-        return False
-    start = file.tell() - (4 if implicit else 0)
-    length = int.from_bytes(element[4:8] if implicit else element[8:], "little" if little else "big")
-    return length == _UNDEFINED or 0 < length <= size - start
-
-
-def choose_series(path: Path, wanted: str | None = None) -> Series:
-    """The series that `path` stands for: the one volume in a folder, or that of a file, from the folder it lies in.
-
-    `wanted` names one of several: its number, its UID, or a part of its description. Raises `InputError` that names
-    them all if that leaves none or several.
-    """
-    folder = path if path.is_dir() else path.parent
-    there = series_in(folder)
-    own = str(_slice(path).header.get("SeriesInstanceUID") or "") if path.is_file() else ""
-    if not there or (path.is_file() and own not in [one.uid for one in there]):
-        raise InputError(f"{path}: holds no DICOM series. Give the folder of the slices, or a NIfTI, NRRD or MHA file.")
-    if path.is_file():
-        return next(one for one in there if one.uid == own)
-    if wanted is not None:
-        exact = [one for one in there if wanted in (one.number, one.uid)]
-        chosen = exact or [one for one in there if wanted.lower() in one.description.lower()]
-    else:
-        chosen = [one for one in there if one.may_be_volume]
-    if len(chosen) == 1:
-        return chosen[0]
-    alone = not chosen and len(there) > 2 and all(one.modality in _VOLUMES and len(one.slices) == 1 for one in there)
-    if alone and wanted is None:
-        raise InputError(
-            f"{folder}: each of its {len(there)} DICOM files has a SeriesInstanceUID of its own, so they make no "
-            "series. Export or anonymise them anew, with one UID for all."
-        )
-    listed = _listed(chosen or there)
-    if wanted is not None:
-        how = f"{len(chosen)} of its series are {wanted!r}" if chosen else f"none of its series is {wanted!r}"
-        raise InputError(f"{folder}: {how}; there are: {listed}. Give one's number, its UID or a part of its name.")
-    if not chosen:
-        raise InputError(f"{folder}: none of its DICOM series is a volume; there are: {listed}. Choose another folder.")
-    patients = {one.slices[0].words("PatientID") for one in chosen} - {""}
-    several = f" of {len(patients)} patients (PatientID)" if len(patients) > 1 else ""
-    raise InputError(
-        f"{folder}: holds {len(chosen)} DICOM series{several}, one was expected: {listed}. Choose one: by its number, "
-        "its UID or a part of its name with `--series`, or by the path of one of its files in case.yaml."
-    )
-
-
-def patient_of(path: Path, wanted: str | None = None) -> Patient:
-    """Whom the DICOM series that `choose_series` takes is of; of a file of another format nothing is known."""
-    if not (path.is_dir() or is_dicom(path)):
-        return NOBODY
-    return patient_in(choose_series(path, wanted).slices[0].header)
-
-
-def _listed(series: Sequence[Series]) -> str:
-    """The series in a few words each; with the UIDs of those that nothing else tells apart."""
-    names = [(one.number, one.description) for one in series]
-    alone = [any(name) and names.count(name) == 1 for name in names]
-    told = [one.told if known else f"{one.told} {one.uid}" for one, known in zip(series, alone, strict=True)]
-    more = f" and {len(told) - _MOST_LISTED} more" if len(told) > _MOST_LISTED else ""
-    return ", ".join(told[:_MOST_LISTED]) + more
 
 
 def read_series(series: Series) -> tuple[sitk.Image, tuple[str, ...]]:
@@ -377,7 +160,7 @@ def _check_in_common(series: Series, where: str) -> None:
             if value := one.words(tag):
                 files.setdefault(value, []).append(one.path.name)
         if len(files) > 1 and 2 * len(files) <= len(series.slices):
-            listed = "; ".join(f"{len(names)} as {names[0]}" for names in list(files.values())[:_MOST_LISTED])
+            listed = "; ".join(f"{len(names)} as {names[0]}" for names in list(files.values())[:MOST_LISTED])
             raise InputError(
                 f"{where}: {series.told} holds files of {len(files)} {kinds}, by {tag}: {listed}. Move those of each "
                 "into a folder of its own, or export the series anew."
@@ -484,13 +267,3 @@ def _multi_frame(path: Path) -> sitk.Image:
             f"{path}: its frames cannot be read as one volume ({error}). Export the series with a file for each slice."
         ) from error
     return image_of(volume.array, volume.affine)
-
-
-def image_of(array: NDArray[Any], lps_from_index: NDArray[np.float64]) -> sitk.Image:
-    """A volume of highdicom, whose `array` is indexed as the columns of its affine are, as an image of SimpleITK."""
-    image = sitk.GetImageFromArray(np.ascontiguousarray(array.transpose(2, 1, 0)))
-    spacing = np.linalg.norm(lps_from_index[:3, :3], axis=0)
-    image.SetSpacing(spacing.tolist())
-    image.SetDirection((lps_from_index[:3, :3] / spacing).ravel().tolist())
-    image.SetOrigin(lps_from_index[:3, 3].tolist())
-    return image

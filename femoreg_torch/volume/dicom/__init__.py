@@ -1,0 +1,1 @@
+"""CT from DICOM: headers of files, the series of a folder, and one of them as a volume."""
