@@ -1,69 +1,50 @@
 """A case folder made of the files that scanner, 3D Slicer, TotalSegmentator and C-arm leave: `femoreg new-case`."""
 
 import re
-import shutil
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 import torch
 import yaml
-from torch import Tensor
 
-from femoreg_torch.anatomy import HIP, LabelTable, label_table, label_table_names
+from femoreg_torch.anatomy import label_table
 from femoreg_torch.case.femoroplasty import (
-    ANATOMY_IMAGES,
     DEVICE,
     DEVICE_END,
-    DEVICE_IMAGES,
     DEVICE_POINTS,
     FEMUR,
     TEMPLATE,
     femoral_head,
-    operated_femur,
 )
-from femoreg_torch.case.model import Intensity, Side
 from femoreg_torch.case.nominal import ALONG_PATH, NominalPlace
 from femoreg_torch.case.reading import CASE_NAME, VERSIONS
-from femoreg_torch.case.writing import display_content
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import new_folder, plain, write_text
-from femoreg_torch.fluoro import (
-    Display,
-    Exposure,
-    Source,
-    carm_settings,
-    may_be_image,
-    nearest_side,
-    other_patient,
-    read_header,
-)
 from femoreg_torch.geometry import read_itk_transform
 from femoreg_torch.intake.check import check_case
+from femoreg_torch.intake.given import NewCase, copied, short_name
 from femoreg_torch.intake.label_tables import table_of_map
+from femoreg_torch.intake.new_anatomy import (
+    operated_side,
+    placed_ct,
+    placed_labels,
+    proposed_landmarks,
+    segmented_labels,
+    told_bones,
+)
+from femoreg_torch.intake.new_views import carm_content, display_of_images, image_files, notes_on_patients, placed_views
 from femoreg_torch.intake.volumes import header_warnings
 from femoreg_torch.paths import why_unreadable
-from femoreg_torch.segment import load_bone_network, propose_landmarks, segment_bones
 from femoreg_torch.volume import (
-    Volume,
-    bone_labels,
     is_in_ras,
-    patient_of,
     read_ct_told,
-    read_labels_told,
     read_landmarks,
     read_mesh,
     read_path_points,
     write_landmarks,
-    write_volume,
 )
-from femoreg_torch.volume.bones import nearest_label
-from femoreg_torch.volume.dicom.headers import is_dicom
-from femoreg_torch.volume.itk import DETACHED, read_itk
-from femoreg_torch.volume.reading import write_image
 
 NEEDED = ("ct", "labels", "landmarks", "plan", "images")
-_COPIED = (".nii", ".nii.gz", ".nrrd", ".mha")  # volumes of one file, which are taken as they are
 _OWN_TABLE = "femoreg"  # of label maps that are made here
 _SAID_BY = {  # what a problem asks to write into `case.yaml`, and the options that write it
     "`display:": "--source, --mirrored, --turned or --ignore-header",
@@ -72,38 +53,6 @@ _SAID_BY = {  # what a problem asks to write into `case.yaml`, and the options t
     "`carm:": "--carm",
 }
 _DEVICE_HU = 5000.0  # of the paper's device
-
-
-@dataclass(frozen=True)
-class NewCase:
-    """What a case is made of; what is None or empty was not given. See the command's help."""
-
-    ct: Path | None = None
-    series: str | None = None
-    labels: Path | None = None
-    bones: str | None = None
-    landmarks: Path | None = None
-    plan: Path | None = None
-    side: Side | None = None
-    device: Path | None = None
-    device_points: Path | None = None
-    material: str | None = None
-    hu: float | None = None
-    guide: str | None = None
-    before_entry_mm: float = 0.0
-    turned_deg: float = 0.0
-    in_front_mm: float = 0.0
-    device_transform: Path | None = None
-    images: tuple[Path, ...] = ()
-    device_images: tuple[Path, ...] = ()
-    carm: str | None = None
-    intensity: Intensity | None = None
-    frames: int | Literal["mean"] | None = None
-    source: Source | None = None
-    mirrored: bool = False
-    turned: int = 0
-    ignore_header: bool = False
-    segment: bool = False  # labels and landmarks that are not given are found in the CT
 
 
 def make_case(out: Path, given: NewCase) -> list[str]:
@@ -134,10 +83,10 @@ def make_case(out: Path, given: NewCase) -> list[str]:
 def _sources(content: dict[str, Any], given: NewCase) -> dict[str, Path]:
     """The files given, by the names that the case has for those that are read first when it is checked."""
     views = content["views"]
-    sources = {view["anatomy"]: path for view, path in zip(views, _files(given.images, []), strict=True)}
+    sources = {view["anatomy"]: path for view, path in zip(views, image_files(given.images, []), strict=True)}
     if given.device is not None:
         sources[content[DEVICE]["model"]] = given.device
-        sources |= {view[DEVICE]: path for view, path in zip(views, _files(given.device_images, []), strict=False)}
+        sources |= {view[DEVICE]: path for view, path in zip(views, image_files(given.device_images, []), strict=False)}
     return sources
 
 
@@ -145,7 +94,7 @@ def _as_given(problem: str, folder: Path, sources: dict[str, Path]) -> str:
     """The problem with the files given in place of their copies in `folder`, which are not kept, nor is its form."""
     problem = re.sub(rf"\b({CASE_NAME}), line \d+", r"\1", problem)
     copies = rf"({re.escape(str(folder))}/)?\b({'|'.join(map(re.escape, sources))})(?!\w)"
-    return re.sub(copies, lambda found: str(sources[found[2]]) if found[1] else _short(sources[found[2]]), problem)
+    return re.sub(copies, lambda found: str(sources[found[2]]) if found[1] else short_name(sources[found[2]]), problem)
 
 
 def _check_given(given: NewCase) -> None:
@@ -189,13 +138,13 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     given_landmarks = None if given.landmarks is None else read_landmarks(given.landmarks)
     entry_point, target = read_path_points(given.plan)
     if given.labels is None:
-        bones, (labels_name, labels) = label_table(_OWN_TABLE), _segmented(folder, ct, notes)
+        bones, (labels_name, labels) = label_table(_OWN_TABLE), segmented_labels(folder, ct, notes)
     else:
         bones, more = table_of_map(given.labels, given.bones)
         notes += more
-        labels_name, labels = _labels(folder, given.labels, ct, bones, notes)
-    landmarks = given_landmarks or _proposed(labels, ct, bones, notes)
-    side = given.side or _side(labels, ct, bones, landmarks, entry_point, header_warnings(given.ct), notes)
+        labels_name, labels = placed_labels(folder, given.labels, ct, bones, notes)
+    landmarks = given_landmarks or proposed_landmarks(labels, ct, bones, notes)
+    side = given.side or operated_side(labels, ct, bones, landmarks, entry_point, header_warnings(given.ct), notes)
     if femoral_head(side) not in landmarks:
         raise InputError(
             f"{given.landmarks or '--segment'}: {femoral_head(side)}, the head of the operated femur, is "
@@ -206,7 +155,7 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
         "version": VERSIONS[-1],
         "template": TEMPLATE,
         "side": side,
-        "ct": {"image": _ct(folder, given.ct, ct), "labels": labels_name, "bones": _told_bones(bones)},
+        "ct": {"image": placed_ct(folder, given.ct, ct), "labels": labels_name, "bones": told_bones(bones)},
         "landmarks": "landmarks.json",
         "plan": {"entry_point": entry_point, "target": "FH" if target is None else target},
     }
@@ -214,97 +163,12 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
         notes.append("the path's target is the femoral head, as the plan has no other")
     if given.device is not None:
         content[DEVICE] = _device(folder, given, notes)
-    images, device_images = _files(given.images, notes), _files(given.device_images, notes)
-    notes += _other_patient(given, images, device_images)
-    content["carm"] = _carm(folder, given, images[0], notes)
-    content |= _display(given, images, notes)
-    content["views"] = _views(folder, images, device_images, given, notes)
+    images, device_images = image_files(given.images, notes), image_files(given.device_images, notes)
+    notes += notes_on_patients(given, images, device_images)
+    content["carm"] = carm_content(folder, given, images[0], notes)
+    content |= display_of_images(given, images, notes)
+    content["views"] = placed_views(folder, images, device_images, given, notes)
     return content
-
-
-def _segmented(folder: Path, ct: Volume, notes: list[str]) -> tuple[str, Volume]:
-    """The name of the label map of the bones that the network finds in the CT, and the map."""
-    found = segment_bones(ct, load_bone_network())
-    write_volume(folder / "labels.nii.gz", found.labels)
-    sure = ", ".join(f"{bone} {share:.2f}" for bone, share in found.confidence.items())
-    notes.append(f"the bones were found in the CT by the shipped network (mean probability: {sure}): look at them")
-    notes += found.warnings
-    return "labels.nii.gz", found.labels
-
-
-def _proposed(labels: Volume, ct: Volume, bones: LabelTable, notes: list[str]) -> dict[str, Tensor]:
-    """Landmarks by the rules of `femoreg landmarks`."""
-    found = propose_landmarks(ct, bone_labels(labels, ct, bones, HIP, {}))
-    errors = ", ".join(f"{name} {error:.1f}" for name, error in found.expected_error_mm.items())
-    notes.append(
-        f"the landmarks are proposals by rules, with errors to expect of (mm) {errors}: correct landmarks.json"
-    )
-    notes += [f"no {name}: {why}" for name, why in found.left_out.items()]
-    notes += found.warnings
-    return found.points
-
-
-def _ct(folder: Path, path: Path, ct: Volume) -> str:
-    if path.is_file() and path.name.lower().endswith(_COPIED):
-        return _copied(path, folder, "ct")
-    write_volume(folder / "ct.nii.gz", ct)
-    return "ct.nii.gz"
-
-
-def _copied(path: Path, folder: Path, stem: str) -> str:
-    """Copy a file under a name that says what it is, and return that name.
-
-    A header whose values stand in a file of their own is written together with them.
-    """
-    if path.name.lower().endswith(DETACHED):
-        write_image(folder / f"{stem}.mha", read_itk(path))
-        return f"{stem}.mha"
-    suffix = next((s for s in (".seg.nrrd", ".nii.gz") if path.name.lower().endswith(s)), path.suffix.lower())
-    name = stem + (suffix or ".dcm")
-    shutil.copyfile(path, folder / name)
-    return name
-
-
-def _told_bones(bones: LabelTable) -> str | dict[str, list[int]]:
-    for name in label_table_names():
-        if label_table(name) == bones:
-            return name
-    return {bone: list(ids) for bone, ids in bones.items()}
-
-
-def _labels(folder: Path, path: Path, ct: Volume, bones: LabelTable, notes: list[str]) -> tuple[str, Volume]:
-    """The name of the label map in `folder`, and the map on the grid of the CT."""
-    ids = {n for of_bone in bones.values() for n in of_bone}
-    labels, told = read_labels_told(path, ct, ids)
-    if path.is_file() and path.name.lower().endswith(_COPIED):
-        return _copied(path, folder, "labels"), labels  # what was done is done again, and told, whenever it is read
-    notes += told
-    write_volume(folder / "labels.nii.gz", labels)
-    return "labels.nii.gz", labels
-
-
-def _side(
-    labels: Volume,
-    ct: Volume,
-    bones: LabelTable,
-    landmarks: dict[str, Tensor],
-    entry_point: Tensor,
-    doubts: list[str],
-    notes: list[str],
-) -> Side:
-    """The side whose femur the entry point lies on. Raises `InputError` if it lies on none, with `doubts` of the CT."""
-    found = bone_labels(labels, ct, bones, HIP, landmarks)
-    sides = {found.ids[operated_femur(side)]: side for side in ("left", "right") if operated_femur(side) in found.ids}
-    label = nearest_label(found.labels, list(sides), entry_point) if sides else None
-    if label is None:
-        where = ", ".join(f"{v:.1f}" for v in entry_point.tolist())
-        raise InputError(
-            f"--side: is missing, and the entry point ({where}) mm LPS lies on no femur of the label map. Give the "
-            "side, and check the plan's coordinate system (RAS or LPS)."
-            + "".join(f" Of the CT, {doubt}." for doubt in doubts)
-        )
-    notes.append(f"the operated side is the {sides[label]} one, as the entry point lies on its femur")
-    return cast(Side, sides[label])
 
 
 def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
@@ -321,7 +185,7 @@ def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     if "center" not in points:
         points["center"] = torch.tensor(read_mesh(given.device).bounds.mean(0), dtype=torch.float64)
         notes.append("errors of the device are told at the middle of its box, as no point `center` is given")
-    content: dict[str, Any] = {"model": _copied(given.device, folder, DEVICE)}
+    content: dict[str, Any] = {"model": copied(given.device, folder, DEVICE)}
     if given.material is not None:
         content["material"] = given.material
     else:
@@ -336,110 +200,3 @@ def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
         mm, where = abs(given.before_entry_mm), "past" if given.before_entry_mm < 0 else "before"
         notes.append(f"the device starts {ALONG_PATH}, its tip {mm:g} mm {where} the entry point")
     return content | {"start": vars(place)}
-
-
-def _files(paths: tuple[Path, ...], notes: list[str]) -> list[Path]:
-    """The files themselves, and the images of folders, by name: numbers in names count as numbers."""
-    found: list[Path] = []
-    for path in paths:
-        if not path.is_dir():
-            found.append(path)
-            continue
-        files = [entry for entry in path.rglob("*") if entry.is_file() and not entry.name.startswith(".")]
-        images = [entry for entry in files if may_be_image(entry)]
-        found += sorted(images, key=_counted)
-        if others := sorted(entry.name for entry in set(files) - set(images)):
-            notes.append(f"{path}: passed over {', '.join(others)[:200]}, which hold no image")
-    if paths and not found:
-        raise InputError(f"{paths[0]}: a folder without images. Name images, or a folder of images.")
-    return found
-
-
-def _counted(path: Path) -> list[tuple[int, str]]:
-    """A key by which `IM2` comes before `IM10`."""
-    return [(int(word), "") if word.isdecimal() else (-1, word) for word in re.split(r"(\d+)", str(path))]
-
-
-def _other_patient(given: NewCase, images: list[Path], device_images: list[Path]) -> list[str]:
-    """In words, whether headers of images tell another patient than that of the CT, which the case does not keep."""
-    assert given.ct is not None
-    of_kinds = ((ANATOMY_IMAGES, images), (DEVICE_IMAGES, device_images))
-    exposures = [
-        Exposure(view, kind, _short(path), read_header(path))
-        for kind, paths in of_kinds
-        for view, path in enumerate(paths)
-        if is_dicom(path)
-    ]
-    return other_patient(exposures, patient_of(given.ct, given.series))
-
-
-def _views(
-    folder: Path, images: list[Path], device_images: list[Path], given: NewCase, notes: list[str]
-) -> list[dict[str, Any]]:
-    if device_images and len(device_images) != len(images):
-        raise InputError(
-            f"--device-images: {len(device_images)} files, but there are {len(images)} images without the device. Give "
-            "one of each for every C-arm pose, in the same order."
-        )
-    said = {"intensity": given.intensity, "frames": given.frames}
-    views: list[dict[str, Any]] = []
-    for number, path in enumerate(images, 1):
-        view: dict[str, Any] = {"anatomy": _copied(path, folder, f"view{number}")}
-        if device_images:
-            view[DEVICE] = _copied(device_images[number - 1], folder, f"view{number}_device")
-        views.append(view | {key: value for key, value in said.items() if value is not None})
-    beside = [f", with the device {_short(path)}" for path in device_images] or [""] * len(images)
-    notes += [f"view {n} is {_short(path)}{more}" for n, (path, more) in enumerate(zip(images, beside, strict=True), 1)]
-    return views
-
-
-def _short(path: Path) -> str:
-    """The file with its folder, as images of several folders often bear the same names."""
-    return str(Path(path.resolve().parent.name) / path.name)
-
-
-def _carm(folder: Path, given: NewCase, image: Path, notes: list[str]) -> str | dict[str, Any]:
-    """The preset's name, the copied YAML file's, or what the tags of a DICOM image say."""
-    if given.carm is not None:
-        if given.carm.endswith((".yaml", ".yml")):
-            if (why := why_unreadable(Path(given.carm))) is not None:
-                raise InputError(f"--carm: {given.carm}: {why}")
-            return _copied(Path(given.carm), folder, "carm")
-        return given.carm
-    if not is_dicom(image):
-        raise InputError(f"--carm: is missing, and {image.name} is no DICOM file whose tags could say it.")
-    try:
-        carm = carm_settings(image)
-    except InputError as error:
-        raise InputError(
-            f"--carm: is missing. {error} A YAML file with these can be given: --carm my_carm.yaml."
-        ) from error
-    told = f"source to detector {carm['sdd_mm']:g} mm, pixels of {carm['pixel_mm'][0]:g} mm"
-    notes.append(f"the C-arm is that of the tags of {image.name}: {told}. It should be calibrated")
-    return carm
-
-
-def _display(given: NewCase, images: list[Path], notes: list[str]) -> dict[str, Any]:
-    """How pictures are stored: as the flags say, or else as the header of the first image does.
-
-    What other images say is held against it when the case is checked.
-    """
-    source, tags = given.source, read_header(images[0]) if is_dicom(images[0]) else None
-    known = None if given.ignore_header else tags
-    if source is None and known is not None and known.source_deg is not None:
-        source = nearest_side(known.source_deg)
-        notes.append(f"the source stands on the patient's {source} side, by the header of {images[0].name}")
-    display = Display(source or "anterior", given.mirrored, given.turned, given.ignore_header)
-    told = None if known is None else known.display(display.source)
-    if told is not None and told != display and not given.mirrored and not given.turned:
-        display = told
-        words = [
-            *(["mirrored"] if told.mirrored else []),
-            *([f"turned by {told.turned_deg}°"] if told.turned_deg else []),
-        ]
-        notes.append(f"the pictures are {' and '.join(words)}, by PatientOrientation in the header of {images[0].name}")
-    if source is None:
-        notes.append(
-            "the source is taken to stand in front of the patient, as neither --source nor a header says where it is"
-        )
-    return display_content(display)
