@@ -40,7 +40,7 @@ def doubts(
     questions: list[Callable[[], tuple[str, ...]]] = [
         lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
-        lambda: doubts_about_motion(covariance, given=scene.camera_from_camera1 is not None),
+        lambda: doubts_about_motion(covariance, limits, given=scene.camera_from_camera1 is not None),
         lambda: doubts_about_the_plan(case, scene),
         lambda: doubts_about_the_guide(case, poses),
         lambda: doubts_about_the_models(told, scene, poses),

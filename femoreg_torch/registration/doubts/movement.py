@@ -1,7 +1,9 @@
 """Anatomy and devices that moved between the images, in words."""
 
+from femoreg_torch.case.quality import largest
 from femoreg_torch.registration.evidence.covariance import PoseCovariance
 from femoreg_torch.registration.evidence.motion import GuideDrift, JointTurn, MotionBetween
+from femoreg_torch.registration.quality import Limits
 
 # Of the anatomy between images without and with the device. Seen in all views together where nothing had moved,
 # whatever else was wrong: at most 0.1 mm, 0.2° and 1.6 deviations; in one view by itself 0.4 mm, 0.1° and 2.8. Where a
@@ -31,7 +33,7 @@ _GAIN_OF_BONE_DRIFT = 0.004
 _MOST_JOINT_TURN_DEG, _SURE_OF_JOINT_TURN, _GAIN_OF_JOINT_TURN = 0.8, 3.0, 0.0009
 
 
-def doubts_about_motion(covariance: PoseCovariance, *, given: bool = False) -> tuple[str, ...]:
+def doubts_about_motion(covariance: PoseCovariance, limits: Limits, *, given: bool = False) -> tuple[str, ...]:
     """Anatomy that lies elsewhere in images of another kind, or a device that moved between the views, in words.
 
     Where the poses of the C-arm were `given`, these may be off as well.
@@ -43,7 +45,7 @@ def doubts_about_motion(covariance: PoseCovariance, *, given: bool = False) -> t
     if any(_has_moved(each) for each in covariance.motions):
         moved.append(max(covariance.motions, key=lambda each: each.gain))
     if not moved:
-        return doubts_about_joints(covariance) or doubts_about_guides(covariance)
+        return doubts_about_joints(covariance) or doubts_about_guides(covariance, limits)
     or_given = ", or the poses that the case gives (`camera_from_camera1`) are off" if given else ""
     found = max(moved, key=lambda each: each.gain)
     deg, mm = found.size
@@ -82,9 +84,18 @@ def doubts_about_joints(covariance: PoseCovariance) -> tuple[str, ...]:
     )
 
 
-def doubts_about_guides(covariance: PoseCovariance) -> tuple[str, ...]:
-    """A tool that slid along its guide or turned about it in one view, in words: what explains the images best."""
+def doubts_about_guides(covariance: PoseCovariance, limits: Limits) -> tuple[str, ...]:
+    """A tool that slid along its guide or turned about it in one view, in words: what explains the images best.
+
+    Where the images leave its rotation open by more than is trusted, as its quality says, a turn in one view means
+    nothing more.
+    """
     moved = [each for each in covariance.guide_drifts if _has_drifted_along(each)]
+    moved = [
+        each
+        for each in moved
+        if not each.turns or largest(covariance.by_images(each.name)[0]) <= limits.most_deviation_deg
+    ]
     if not moved:
         return ()
     found = max(moved, key=lambda each: each.gain)

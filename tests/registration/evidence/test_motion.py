@@ -13,11 +13,13 @@ from femoreg_torch.registration.doubts.movement import doubts_about_guides, doub
 from femoreg_torch.registration.evidence.covariance import pose_covariance
 from femoreg_torch.registration.evidence.motion import GuideDrift, JointTurn, MotionBetween
 from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.quality import Limits
 from femoreg_torch.registration.roundness import Axis
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.similarity import GradNcc
 
 _LEVEL = Level(pixel_mm=3.0, step_mm=2.0)
+LIMITS = Limits(most_deviation_deg=90.0)  # coarse images fix a device to some degrees
 _TURN, _SHIFT = (0.0, 0.0, 1.2), (1.4, -0.9, 0.0)  # in the image plane of the first view
 
 
@@ -37,7 +39,7 @@ def _scene(moving: tuple[str, ...], views: tuple[int, ...] = (0, 1, 2)) -> Scene
 
 def _motions(scene: Scene) -> tuple[tuple[MotionBetween, ...], tuple[str, ...]]:
     covariance = pose_covariance(scene, true_poses(), _LEVEL, GradNcc(1))
-    return covariance.motions, doubts_about_motion(covariance)
+    return covariance.motions, doubts_about_motion(covariance, LIMITS)
 
 
 def test_no_motion_is_told_where_nothing_moved() -> None:
@@ -77,7 +79,7 @@ def test_one_kind_of_images_tells_nothing_of_motion() -> None:
     objects = {name: scene.objects[name] for name in ("pelvis", "femur")}
     covariance = pose_covariance(replace(scene, objects=objects), alone, _LEVEL, GradNcc(1))
     assert covariance.motions == ()
-    assert doubts_about_motion(covariance) == ()
+    assert doubts_about_motion(covariance, LIMITS) == ()
 
 
 @pytest.mark.parametrize(
@@ -92,7 +94,7 @@ def test_all_views_together_need_less_certainty(views: tuple[int, ...], sigmas: 
     motion = torch.tensor([0.0, 0.0, 1.8, 0.0, 0.0, 0.4], dtype=torch.float64)
     found = MotionBetween("device", views, ("femur",), motion, motion.abs() / sigmas + 1e-9, gain)
     covariance = replace(pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(found,))
-    assert len(doubts_about_motion(covariance)) == told
+    assert len(doubts_about_motion(covariance, LIMITS)) == told
 
 
 def test_a_device_that_moved_between_the_views_is_told() -> None:
@@ -107,7 +109,7 @@ def test_a_device_that_moved_between_the_views_is_told() -> None:
         covariance = pose_covariance(scene, truth, _LEVEL, GradNcc(1))
         of_device = [drift for drift in covariance.drifts if drift.objects == ("device",)]
         assert [drift.views for drift in of_device] == [(0,), (1,), (2,)]
-        said = doubts_about_motion(covariance)
+        said = doubts_about_motion(covariance, LIMITS)
         assert len(said) == told, said
     assert "in the device image of view 2, the device lies elsewhere" in said[0]
     best = max(covariance.drifts, key=lambda drift: drift.gain)
@@ -125,7 +127,7 @@ def test_a_leg_that_turned_between_the_views_is_told() -> None:
         covariance = pose_covariance(scene, truth, _LEVEL, GradNcc(1))
         of_femur = [drift for drift in covariance.drifts if drift.objects == ("femur",)]
         assert [drift.views for drift in of_femur] == [(0,), (1,), (2,)]
-        said = doubts_about_motion(covariance)
+        said = doubts_about_motion(covariance, LIMITS)
         assert len(said) == told, said
     assert "in view 3, the femur lies" in said[0]
     assert float(of_femur[2].motion[2]) == pytest.approx(3.0, abs=0.6)
@@ -158,7 +160,7 @@ def test_a_turn_in_a_joint_is_told_that_is_far_and_sure_and_explains_something(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)),
         motions=(), drifts=(), guide_drifts=(), joint_turns=(turn,),
     )  # fmt: skip
-    said = doubts_about_motion(covariance)
+    said = doubts_about_motion(covariance, LIMITS)
     assert len(said) == told
     assert all("in view 3, the femur is turned by 1.3° in its joint" in one for one in said)
 
@@ -170,7 +172,7 @@ def test_a_bone_must_gain_more_than_a_device_to_have_drifted(gain: float, told: 
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(), drifts=(drift,)
     )
-    assert len(doubts_about_motion(covariance)) == told
+    assert len(doubts_about_motion(covariance, LIMITS)) == told
 
 
 @pytest.mark.parametrize(("gain", "sigmas", "told"), [(0.0025, 1.1, 1), (0.0012, 3.5, 1), (0.0015, 2.2, 0)])
@@ -180,7 +182,7 @@ def test_a_drift_is_told_by_what_it_gains_and_how_sure_it_is(gain: float, sigmas
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(), drifts=(drift,)
     )
-    assert len(doubts_about_motion(covariance)) == told
+    assert len(doubts_about_motion(covariance, LIMITS)) == told
 
 
 def _held(way: Tensor, view: int) -> Scene:
@@ -216,7 +218,7 @@ def test_a_slide_or_a_turn_in_one_view_is_measured(way: Tensor, turns: bool, amo
 def test_a_device_that_was_held_still_neither_slides_nor_turns() -> None:
     covariance = pose_covariance(_held(torch.zeros(6, dtype=torch.float64), 1), true_poses(), _LEVEL, GradNcc(1))
     assert max(each.sureness for each in covariance.guide_drifts) < 3
-    assert doubts_about_guides(covariance) == ()
+    assert doubts_about_guides(covariance, LIMITS) == ()
 
 
 def test_a_round_device_is_not_asked_for_its_turn() -> None:
@@ -247,6 +249,17 @@ def test_what_is_far_sure_and_explains_something_is_told(
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), drifts=(), guide_drifts=(found,)
     )
-    told = doubts_about_motion(covariance)
+    told = doubts_about_motion(covariance, LIMITS)
     assert len(told) == (words is not None)
     assert words is None or words in told[0]
+
+
+@pytest.mark.parametrize(("most_deg", "turns", "told"), [(90.0, True, 1), (0.0, True, 0), (0.0, False, 1)])
+def test_a_turn_in_one_view_is_not_told_where_the_images_leave_the_rotation_open(
+    most_deg: float, turns: bool, told: int
+) -> None:
+    found = GuideDrift("device", 1, "device", turns, 3.4, 0.6, 0.001)
+    covariance = replace(
+        pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), drifts=(), guide_drifts=(found,)
+    )
+    assert len(doubts_about_motion(covariance, Limits(most_deviation_deg=most_deg))) == told
