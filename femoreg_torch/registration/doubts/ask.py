@@ -15,7 +15,7 @@ from femoreg_torch.registration.doubts.device import (
     doubts_beside_devices,
 )
 from femoreg_torch.registration.doubts.images import doubts_about_smears, doubts_about_the_images
-from femoreg_torch.registration.doubts.movement import doubts_about_motion
+from femoreg_torch.registration.doubts.movement import doubts_about_motion, explains_the_carm
 from femoreg_torch.registration.doubts.plan import doubts_about_the_guide, doubts_about_the_plan
 from femoreg_torch.registration.doubts.shape import doubts_about_handedness, doubts_about_rigidity
 from femoreg_torch.registration.evidence.covariance import PoseCovariance
@@ -37,10 +37,13 @@ def doubts(
         plan = *doubts_about_the_plan(case, scene), *doubts_about_the_guide(case, poses)
         return (*told.contradictions, *doubts_about_units(case, told, True), *strange, *plan)
     clear = scene.where_unsaturated()
-    questions: list[Callable[[], tuple[str, ...]]] = [
+    geometry: list[Callable[[], tuple[str, ...]]] = [
         lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
         lambda: doubts_about_motion(covariance, limits, given=scene.camera_from_camera1 is not None),
+    ]
+    questions: list[Callable[[], tuple[str, ...]]] = [
+        *(geometry[::-1] if explains_the_carm(covariance) else geometry),
         lambda: doubts_about_the_plan(case, scene),
         lambda: doubts_about_the_guide(case, poses),
         lambda: doubts_about_the_models(told, scene, poses),

@@ -9,7 +9,7 @@ from registration_scenes import REFERENCE_POINTS, make_scene, off, true_poses
 from torch import Tensor
 
 from femoreg_torch.geometry import about_point, exp_se3
-from femoreg_torch.registration.doubts.movement import doubts_about_guides, doubts_about_motion
+from femoreg_torch.registration.doubts.movement import doubts_about_guides, doubts_about_motion, explains_the_carm
 from femoreg_torch.registration.evidence.covariance import pose_covariance
 from femoreg_torch.registration.evidence.motion import GuideDrift, JointTurn, MotionBetween
 from femoreg_torch.registration.level import Level
@@ -236,7 +236,9 @@ def test_a_round_device_is_not_asked_for_its_turn() -> None:
         (True, -3.4, 2.5, 0.001, "view 2, the device is turned by 3° about its guide"),
         (False, 0.4, 5, 0.001, None),  # small
         (True, 1.5, 5, 0.001, None),
-        (False, 1.4, 2, 0.001, None),  # unsure
+        (False, 1.4, 2, 0.0005, None),  # unsure
+        (False, 1.4, 2, 0.001, "view 2, the device lies 1.4 mm along its guide"),  # explains more
+        (False, 1.4, 0.9, 0.001, None),
         (True, 3.4, 1.0, 0.001, None),
         (False, 1.4, 5, 0.0001, None),  # explains nothing
         (True, 3.4, 2.5, 0.0001, None),
@@ -263,3 +265,13 @@ def test_a_turn_in_one_view_is_not_told_where_the_images_leave_the_rotation_open
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), drifts=(), guide_drifts=(found,)
     )
     assert len(doubts_about_motion(covariance, Limits(most_deviation_deg=most_deg))) == told
+
+
+@pytest.mark.parametrize(("gain", "told"), [(0.0025, False), (0.012, True)])
+def test_only_what_explains_much_may_be_the_cause_of_what_speaks_against_the_carm(gain: float, told: bool) -> None:
+    covariance = pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1))
+    assert not explains_the_carm(covariance)
+    turned = JointTurn(1, "femur", 2.5, 4.0, gain)
+    assert explains_the_carm(replace(covariance, joint_turns=(turned,))) == told
+    device = replace(covariance.drifts[0], kind="device", gain=1.0)  # a device that moved moves no C-arm
+    assert not explains_the_carm(replace(covariance, drifts=(device,), joint_turns=()))
