@@ -20,7 +20,11 @@ from femoreg_torch.intake.found import Found
 from femoreg_torch.intake.planes import Picture, three_planes
 from femoreg_torch.intake.volumes import ct_warnings, described, header_warnings
 from femoreg_torch.pnp import MINIMUM
-from femoreg_torch.registration.prepare.plan_and_landmarks import MOST_OFF_BONE_MM, MOST_OFF_HEAD_MM
+from femoreg_torch.registration.prepare.plan_and_landmarks import (
+    MOST_OFF_BONE_MM,
+    MOST_OFF_HEAD_MM,
+    told_of_bare_bone,
+)
 from femoreg_torch.segment import Head, doubted_radius, doubted_slices, head_of
 from femoreg_torch.volume import (
     NOBODY,
@@ -113,7 +117,7 @@ def check_bones(
         numbers = ", ".join(map(str, ids))
         if anatomy is None or anatomy.landmarks_of(bone):
             found.warnings.append(
-                f"no voxel of {path.name} carries the label {numbers}, the {bone}: nothing is lost if the CT shows none"
+                f"no voxel of {path.name} carries the label {numbers}, the {bone}: right if the CT shows none"
             )
         else:  # vertebrae and sacrum: few CTs of a hip show all that a table names
             found.facts.append(f"not in {path.name}: {bone}")
@@ -172,8 +176,10 @@ def check_heads(seen: SeenAnatomy, found: Found) -> None:
 
 
 def check_head(side: Side, seen: SeenAnatomy, found: Found) -> None:
-    """The operated femoral head, which paths end in, lies in the middle of the sphere that fits the bone's."""
+    """The operated femoral head lies in the middle of the sphere that fits the bone's, and among labelled bones."""
     name = femoral_head(side)
+    if seen.ct is not None and seen.bones is not None and name in seen.landmarks:
+        found.warnings += told_of_bare_bone(name, seen.landmarks[name], seen.ct, seen.bones)
     head = seen.heads.get(side)
     if head is None or not (head.may_be_one and head.is_round) or name not in seen.landmarks:
         return

@@ -34,10 +34,10 @@ _GAIN_OF_A_TURNED_END = 0.0018
 # apart where that gained anything. A wire that was bowed by 4 mm was 0.6 and 1.1 mm apart, by 8.9 and 5.5 deviations,
 # and gained 0.0003.
 _MOST_APART_OF_KNOWN_MM, _SURE_OF_A_KNOWN_BEND = 0.5, 5.0
-# Of a model whose materials are estimated: less gain is believed of an end that is surely elsewhere alone. On images
-# of two other simulators five right devices seemed 1.1 to 5.4 mm apart, by 4.5 to 5.7 deviations and gains of 0.0003 to
-# 0.0005; four bent ones gained 0.0014 to 0.005, by 8.5 to 18.
-_GAIN_OF_A_BENT_MODEL, _SURE_OF_A_BENT_MODEL = 0.0008, 7.0
+# Of a model whose materials are estimated: less is believed. On images of three other simulators six right devices
+# seemed 1.1 to 5.4 mm apart, by 4.5 to 6.2 deviations and gains of 0.0003 to 0.0025; five bent ones gained 0.0014 to
+# 0.005, by 8.5 to 18.
+_GAIN_OF_A_BENT_MODEL, _SURE_OF_A_BENT_MODEL = 0.0005, 7.0
 
 
 def doubts_about_handedness(told: Scene, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
@@ -104,6 +104,6 @@ def _is_bent(found: Bend, is_model: bool, materials_known: bool) -> bool:
     apart = found.apart_mm > max(most, sure * found.apart_deviation_mm)
     broken = not is_model and found.gain > _GAIN_OF_BREAK and found.apart_mm > _APART_OF_BREAK_MM
     sure_of_materials = not is_model or materials_known
-    told = sure_of_materials or found.gain > _GAIN_OF_A_BENT_MODEL or found.sureness > _SURE_OF_A_BENT_MODEL
+    told = sure_of_materials or (found.gain > _GAIN_OF_A_BENT_MODEL and found.sureness > _SURE_OF_A_BENT_MODEL)
     surely = found.sureness > (_SURE_OF_A_KNOWN_BEND if materials_known else _SURE_OF_BEND)
     return broken or (apart and told and surely and found.gain > _LEAST_GAIN_OF_BEND)

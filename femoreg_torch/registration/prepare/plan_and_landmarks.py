@@ -6,13 +6,16 @@ round, so that the label map by itself says where their middles are.
 """
 
 from collections.abc import Mapping
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from femoreg_torch.case import Case
 from femoreg_torch.volume import BoneLabels, Volume, shifted_labels
 from femoreg_torch.volume.bones import nearest_voxel
+from femoreg_torch.volume.contradictions import bare_bone
 
 if TYPE_CHECKING:  # with trimesh, whose import the reading of CT and images hides
     from femoreg_torch.segment import Head
@@ -20,6 +23,7 @@ if TYPE_CHECKING:  # with trimesh, whose import the reading of CT and images hid
 # Seen of 60 cases of three simulators, whose landmarks were told by a surface, by rules or by their makers: at most
 # 2.7 mm, and both heads alike by at most 1.0 mm.
 MOST_OFF_HEAD_MM = 5.0
+_HEADS = {"left": "FH-l", "right": "FH-r"}
 MOST_OFF_BONE_MM, _FAR_OFF_BONE_MM = 5.0, 12.0  # of an entry point or target, from the middle of the nearest voxel
 _NOT_ASKED_MM = 1.0  # of the head that the path ends in, or of the left one: then both cannot be off alike
 # Of both in one direction, besides half a voxel, and how far that may differ between them.
@@ -30,8 +34,9 @@ def heads_near_landmarks(case: Case, bones: BoneLabels) -> dict[str, "Head"]:
     """The femoral heads of the label map, spheres or not, by the names of the landmarks that they are looked for by."""
     from femoreg_torch.segment import head_of  # see above
 
-    names = {"left": "FH-l", "right": "FH-r"}
-    found = {name: head_of(bones, side, case.landmarks[name]) for side, name in names.items() if name in case.landmarks}
+    found = {
+        name: head_of(bones, side, case.landmarks[name]) for side, name in _HEADS.items() if name in case.landmarks
+    }
     return {name: head for name, head in found.items() if head is not None}
 
 
@@ -45,7 +50,26 @@ def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels, heads: Map
             f"the label map would lie on the bones of the CT if it were moved by ({by}) mm LPS: check that it belongs "
             "to this CT, and the origin of both"
         )
+    told += doubts_about_bare_bone(case, ct, bones)
     return (*told, *doubts_about_the_frame(case, bones, heads), *doubts_about_the_ends(case, bones))
+
+
+def doubts_about_bare_bone(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]:
+    """Heads of femora that are registered, about which the CT shows bone that no label covers, in words."""
+    placed = {bone for thing in case.objects.values() for bone in thing.bones}
+    heads = [name for side, name in _HEADS.items() if f"femur_{side}" in placed and name in case.landmarks]
+    return tuple(chain(*(told_of_bare_bone(name, case.landmarks[name], ct, bones) for name in heads)))
+
+
+def told_of_bare_bone(name: str, head: Tensor, ct: Volume, bones: BoneLabels) -> tuple[str, ...]:
+    """How much bone the CT shows about the head (3,) of this name that no label covers, if it is much, in words."""
+    bare = bare_bone(ct, bones.labels, head)
+    if bare is None:
+        return ()
+    return (
+        f"about {name} the CT shows {bare[1]:.0f} ml of bone, {bare[0]:.0%} of what is there, that no label covers: is "
+        "a bone missing in the label map, or its id in `ct.bones`? What is not labelled is not drawn",
+    )
 
 
 def notes_on_the_slices(bones: BoneLabels, heads: Mapping[str, "Head"]) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from femoreg_torch.registration.prepare.plan_and_landmarks import (
     notes_on_the_slices,
 )
 from femoreg_torch.volume import BoneLabels, Volume, axis_aligned
+from femoreg_torch.volume.contradictions import bare_bone
 
 HEADS = {"left": torch.tensor([88.0, -3.0, 4.0]).double(), "right": torch.tensor([-90.0, 2.0, 0.0]).double()}
 IDS = {"femur_left": 1, "femur_right": 2, "hip_left": 3, "hip_right": 4}
@@ -138,3 +139,30 @@ def test_slices_that_are_told_too_far_apart_make_heads_longer_than_wide(
         assert direction == says
         assert float(percent) == pytest.approx(10, abs=1.5)
         assert f"are the slices of the CT {2 * factor:.3g} mm apart" in told[0]
+
+
+@pytest.mark.parametrize(
+    ("lost", "hu", "told"),
+    [
+        ("hip_left", 400.0, True),
+        ("hip_left", 120.0, False),  # the CT shows none: it was cut there, or the socket is of plastic
+        ("hip_left", 3000.0, False),  # metal
+        ("hip_right", 400.0, False),  # of the other side: that femur is not registered
+    ],
+)
+def test_a_bone_beside_the_operated_head_that_no_label_covers(lost: str, hu: float, told: bool) -> None:
+    right, whole = case(HEADS["left"], HEADS["right"]), bones()
+    data = torch.where(whole.labels.data > 0, 400.0, 30.0)
+    ct = whole.labels.with_data(torch.where(whole.labels.data == IDS[lost], hu, data))
+    rest = whole.labels.with_data(torch.where(whole.labels.data == IDS[lost], 0, whole.labels.data))
+    there = BoneLabels(rest, {name: n for name, n in IDS.items() if name != lost})
+    words = told_of_files(right, ct, there)
+    assert [each for each in words if each.startswith("about FH-l the CT shows")] == list(words)
+    assert bool(words) == told
+
+
+def test_a_head_beyond_the_ct_is_not_asked_for_bone() -> None:
+    whole = bones()
+    ct = whole.labels.with_data(torch.where(whole.labels.data > 0, 400.0, 30.0))
+    assert bare_bone(ct, whole.labels.with_data(torch.zeros_like(whole.labels.data)), HEADS["left"]) is not None
+    assert bare_bone(ct, whole.labels, HEADS["left"] + 1000) is None
