@@ -19,6 +19,8 @@ _DIFFER, _LEAST_SHARE, _MOST_OTHER = 0.1, 0.005, 0.2
 def views_exchanged(images: Mapping[str, Tensor], first_kind: str) -> list[str]:
     """In words, which images (H, W) look less like the first one of their own view than like that of another view.
 
+    Or than like the negative of the first one of their own.
+
     Images are named `views[0].anatomy` and so on.
     """
     told = []
@@ -30,7 +32,12 @@ def views_exchanged(images: Mapping[str, Tensor], first_kind: str) -> list[str]:
         if key == f"{view}.{first_kind}" or view not in alike:
             continue
         nearest = max(alike, key=lambda other: alike[other])
-        if alike[nearest] > alike[view] + _MORE_ALIKE:
+        if -alike[view] > alike[nearest] + _MORE_ALIKE:
+            told.append(
+                f"{key}: looks like the negative of {view}.{first_kind} (correlation {alike[view]:.2f}). Are the grey "
+                "values of one of the two inverted? `intensity` stands for all images of a view, so invert one file."
+            )
+        elif alike[nearest] > alike[view] + _MORE_ALIKE:
             told.append(
                 f"{key}: looks like {nearest}.{first_kind} (correlation {alike[nearest]:.2f}) and not like "
                 f"{view}.{first_kind} ({alike[view]:.2f}). Are images of two views exchanged? Both of a view are to be "

@@ -443,6 +443,20 @@ def test_exchanged_images_are_told(files: Path, tmp_path: Path, order: tuple[int
     assert len(warnings) == told, warnings
 
 
+def test_a_device_image_that_was_inverted_is_told_as_that(files: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    for view in (1, 2, 3):
+        lumps = cv2.GaussianBlur(np.random.default_rng(view).normal(size=(48, 40)), (0, 0), 2)
+        image = (30000 * np.exp(lumps / lumps.std() / 4)).astype(np.uint16)
+        cv2.imwrite(str(folder / f"view{view}.png"), image)
+        cv2.imwrite(str(folder / f"view{view}_device.png"), 65535 - image if view == 2 else image - 1)
+    write_content(folder, case_content())
+    warnings = [each for each in check_case(folder, find_start=False).warnings if each.startswith("views[1].device")]
+    assert len(warnings) == 1, warnings
+    assert "looks like the negative of views[1].anatomy" in warnings[0]
+
+
 @pytest.mark.parametrize("intensity", ["raw", "log"])
 @pytest.mark.parametrize("exposure", [0.5, 1.0, 1.8])
 def test_images_with_and_without_the_device_that_are_exchanged_are_told(

@@ -25,8 +25,8 @@ def doubts_about_the_images(scene: Scene, poses: Poses, imaging: Imaging) -> tup
             )
         elif found.as_stored is not None:
             told.append(
-                f"{what} fits nowhere as the case tells it, and {found.as_stored} it does {beside}: check `display` "
-                "and `intensity` of the view"
+                f"{what} does not fit as the case tells it, and {found.as_stored} it does {beside}: check `display` "
+                "and `intensity` of the view, and that all of its images are stored alike"
             )
         elif found.kind != scene.first_kind:
             told.append(

@@ -94,20 +94,10 @@ def _explained(
     kind, view = image
     found = Misfit(kind, view, fits[image], fits[scene.first_kind, 0])
     if kind != scene.first_kind:
-        others = [other for other in range(scene.views) if other != view]
-        if not others:
-            return found
-        swapped = replace(scene, images=scene.images | {kind: (scene.images[kind][view],) * scene.views}, fields={})
-        seen = _similarities(swapped, poses, [(kind, other) for other in others], imaging)
-        best = max(range(len(others)), key=lambda n: seen[n])
-        if seen[best] > max(found.similarity + _BETTER, _FITS * found.in_view_1):
-            return replace(found, as_view=others[best])
-        return found
+        return _explained_where_its_view_is(scene, poses, found, imaging)
     if scene.camera_from_camera1 is not None or view == 0:
         return found
-    stored = scene.image(kind, view)
-    square = stored.shape[0] == stored.shape[1]
-    ways = [way for way in _CHANGES if square or not way.endswith(("90°", "270°"))]
+    ways = _ways(scene, kind, view)
     search = replace(_SEARCH, kinds=[kind], render=scene.shown(poses.camera1_from, kind))
     as_it_is = 1 - search_orbit(scene, poses, search, view, draw).cost  # first, so that what it draws is there
 
@@ -119,6 +109,26 @@ def _explained(
     if seen[best] > as_it_is + _BETTER:
         return replace(found, as_stored=ways[best])
     return found
+
+
+def _explained_where_its_view_is(scene: Scene, poses: Poses, found: Misfit, imaging: Imaging) -> Misfit:
+    """An image whose view the other one places: does it show another view, or was it stored otherwise?"""
+    kind, view = found.kind, found.view
+    others = [other for other in range(scene.views) if other != view]
+    swapped = replace(scene, images=scene.images | {kind: (scene.images[kind][view],) * scene.views}, fields={})
+    seen = _similarities(swapped, poses, [(kind, other) for other in others], imaging) if others else []
+    reasons = [(similarity, replace(found, as_view=other)) for similarity, other in zip(seen, others, strict=True)]
+    for way in _ways(scene, kind, view):
+        (similarity,) = _similarities(_changed(scene, kind, view, _CHANGES[way]), poses, [(kind, view)], imaging)
+        reasons.append((similarity, replace(found, as_stored=way)))
+    best, reason = max(reasons, key=lambda each: each[0])
+    return reason if best > max(found.similarity + _BETTER, _FITS * found.in_view_1) else found
+
+
+def _ways(scene: Scene, kind: Kind, view: int) -> list[str]:
+    """What may have been done to an image when it was stored."""
+    height, width = scene.image(kind, view).shape
+    return [way for way in _CHANGES if height == width or not way.endswith(("90°", "270°"))]
 
 
 def _drawn_once() -> Draw:

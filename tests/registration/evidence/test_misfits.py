@@ -1,5 +1,6 @@
 """Images that do not show what is drawn for them: mirrored, turned, exchanged, of something else."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -53,6 +54,25 @@ def test_an_image_that_was_inverted(scene: Scene) -> None:
     (found,) = (each for each in misfits(strange, TRUTH, PLAIN) if each.kind == "anatomy")
     assert (found.view, found.as_stored) == (1, "with bright and dark exchanged")
     assert "check `display` and `intensity`" in doubts_about_the_images(strange, TRUTH, PLAIN)[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda image: 5 - image, "with bright and dark exchanged"),
+        (lambda image: image.flip(1), "mirrored"),
+        (lambda image: image.rot90(1), "turned by 270°"),
+    ],
+)
+def test_a_device_image_that_was_stored_otherwise_than_the_other_of_its_view(
+    scene: Scene, change: Callable[[torch.Tensor], torch.Tensor], told: str
+) -> None:
+    strange = with_image(scene, "device", 2, change(scene.image("device", 2)))
+    (found,) = misfits(strange, TRUTH, PLAIN)
+    assert (found.kind, found.view, found.as_view, found.as_stored) == ("device", 2, None, told)
+    (doubt,) = doubts_about_the_images(strange, TRUTH, PLAIN)
+    assert doubt.startswith("the device image of view 3 does not fit as the case tells it")
+    assert f"{told} it does" in doubt
 
 
 def test_device_images_that_were_exchanged(scene: Scene) -> None:
