@@ -23,6 +23,7 @@ def inspect(path: Path, *, out: Path = Path("inspect.png"), series: str | None =
     from rich.console import Console
     from rich.markup import escape
 
+    from femoreg_torch.commands.telling import tell
     from femoreg_torch.intake import inspect_path
 
     _check_picture(out, path)
@@ -32,7 +33,7 @@ def inspect(path: Path, *, out: Path = Path("inspect.png"), series: str | None =
     for fact in found.facts:
         console.print(f"  {escape(fact)}", highlight=False)
     for warning in found.warnings:
-        console.print(f"[yellow]Warning:[/] {escape(warning)}.", highlight=False)
+        tell(console, "Warning", warning)
     if found.picture is not None:
         write_picture(out, found.picture)
         console.print(f"Picture: {escape(str(out))}")
@@ -56,6 +57,7 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     from femoreg_torch.case import case_folder
     from femoreg_torch.case.start_files import read_pixels
     from femoreg_torch.commands.status import AMISS, DONE
+    from femoreg_torch.commands.telling import tell
     from femoreg_torch.intake import check_case
 
     case = case_folder(case)
@@ -66,7 +68,7 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     for fact in found.facts:
         console.print(f"  {escape(fact)}", highlight=False)
     for warning in found.warnings:
-        console.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False)
+        tell(console, "Warning", warning)
     for number, problem in enumerate(found.problems, 1):
         console.print(f"[bold red]{number}.[/] {escape(problem)}", highlight=False)
     if found.picture is not None:

@@ -32,6 +32,7 @@ def segment(
     from rich.markup import escape
 
     from femoreg_torch.anatomy import HIP
+    from femoreg_torch.commands.telling import tell
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import check_files, temporary_files, write_json
     from femoreg_torch.intake.planes import planes_through_joints
@@ -82,7 +83,7 @@ def segment(
         sure = f", mean probability {found.confidence[bone]:.2f}" if bone in found.confidence else ""
         console.print(f"  {bone}: {volume_ml:.0f} ml{sure}", highlight=False)
     for warning in found.warnings:
-        console.print(f"[yellow]Warning:[/] {escape(warning)}.", highlight=False)
+        tell(console, "Warning", warning)
     console.print(
         f"Label map: {escape(str(out))}; look at {escape(beside('.png').name)} before you use it.", highlight=False
     )
@@ -106,6 +107,7 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str | None = None, se
     from rich.markup import escape
 
     from femoreg_torch.anatomy import HIP
+    from femoreg_torch.commands.telling import tell
     from femoreg_torch.errors import InputError
     from femoreg_torch.intake.label_tables import table_of_map
     from femoreg_torch.segment import propose_landmarks
@@ -135,5 +137,5 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str | None = None, se
     for name, why in found.left_out.items():
         console.print(f"[yellow]Left out:[/] {name}: {why}.", highlight=False)
     for warning in (*found.warnings, *swapped_sides(known, found.points, HIP)):
-        console.print(f"[yellow]Warning:[/] {escape(warning)}.", highlight=False)
+        tell(console, "Warning", warning)
     console.print(f"Landmarks: {escape(str(out))}. Look at them in 3D Slicer and correct them.", highlight=False)

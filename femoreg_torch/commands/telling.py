@@ -36,6 +36,12 @@ def tell_device(console: Console, name: DeviceName) -> torch.device:
     return device
 
 
+def tell(console: Console, what: str, words: str) -> None:
+    """A warning or a note, as a sentence."""
+    stop = "" if words.endswith((".", "?", "!")) else "."
+    console.print(f"[yellow]{what}:[/] {escape(words)}{stop}", highlight=False)
+
+
 def tell_verdict(console: Console, result: Result) -> None:
     """The verdict, and what was left out or found on the way."""
     verdict = result.verdict
@@ -46,4 +52,4 @@ def tell_verdict(console: Console, result: Result) -> None:
         for reason in verdict.reasons:
             console.print(f"  {escape(reason)}")
     for note in result.skipped:
-        console.print(f"[yellow]Note:[/] {escape(note)}.")
+        tell(console, "Note", note)

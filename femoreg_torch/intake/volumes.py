@@ -11,6 +11,7 @@ import torch
 from femoreg_torch.arrays import opened
 from femoreg_torch.volume import Volume
 from femoreg_torch.volume.borders import touched_faces
+from femoreg_torch.volume.contradictions import intercept_twice
 from femoreg_torch.volume.nifti import NIFTI_SUFFIXES
 from femoreg_torch.volume.text_headers import META_SUFFIXES, NRRD_SUFFIXES
 
@@ -57,7 +58,9 @@ def ct_warnings(ct: Volume) -> list[str]:
     if low > _SOFT_HU or high < _BONE_HU:
         told.append(f"values from {low:g} to {high:g} are not HU of a hip: air is −1000, bone above {_BONE_HU:g}")
         return told
-    if low == 0 or high > 60000 or low < _MOST_PADDING_HU:
+    if (dark := intercept_twice(ct)) is not None:
+        told.append(dark)
+    elif low == 0 or high > 60000 or low < _MOST_PADDING_HU:
         filled = low <= _MOST_PADDING_HU and float((ct.data < -1100).float().mean()) == float(
             (ct.data == low).float().mean()
         )

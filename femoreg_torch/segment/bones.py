@@ -17,6 +17,7 @@ from femoreg_torch.segment.refine import closed_joint_mm2, refined_labels, unref
 from femoreg_torch.segment.without_network import bones_without_network
 from femoreg_torch.volume import Volume, resample_isotropic
 from femoreg_torch.volume.borders import cut_bones
+from femoreg_torch.volume.contradictions import intercept_twice
 from femoreg_torch.volume.round_field import round_field
 
 _BONE_HU, _METAL_HU = 200.0, 2800.0
@@ -113,8 +114,8 @@ def _looked_at(
     if not hips or not femora:
         lacking = " and ".join(name for name, there in (("hip bone", hips), ("upper femur", femora)) if not there)
         raise InputError(
-            f"segment: no {lacking} was found in {bright_ml:.0f} ml of bone. A CT of the hip was expected: is it of "
-            "another part of the body, or turned against what its header says?"
+            f"segment: no {lacking} was found in {bright_ml:.0f} ml of bone. A CT of the hip was expected: "
+            + (intercept_twice(ct) or "is it of another part of the body, or turned against what its header says?")
         )
     left_out = []
     for name in doubtful:

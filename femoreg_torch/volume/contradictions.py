@@ -33,6 +33,8 @@ _REACH_MM = 18.0  # how far a label map is looked for: a best place beyond the f
 _BRIGHT_HU = 150.0, 550.0  # from here on a voxel is bone, from there on it is no more so
 _LEAST_SHIFT_MM, _MOST_SHIFT_MM = 2.5, 15.0
 _LEAST_GAIN = 0.15
+# Of a CT whose intercept of −1024 was applied twice: soft tissue is as dark as air is, and air darker than anything.
+_DARKER_THAN_AIR_HU, _MOST_SO_DARK, _SOFT_HU, _LEAST_SOFT = -1200.0, 0.1, (-250.0, 250.0), 0.03
 # Of the bone about a femoral head what lies beside all labels by two voxels and more: 0.6 % at most in 15 right label
 # maps (of a network, by hand, of simulators), nearly half of it (24 ml) where a map lacked the hip bone of that side.
 _ABOUT_MM, _BONE_HU = 40.0, (250.0, 1800.0)  # beyond is metal
@@ -167,6 +169,23 @@ def misplaced_labels(ct: Volume, labels: Volume, ids: Sequence[int]) -> str | No
     return (
         f"label map: would lie on the bright bones of the CT if it were moved by ({told}) mm LPS: does it belong to "
         "this CT, and do both headers say where the first voxel lies?"
+    )
+
+
+def intercept_twice(ct: Volume) -> str | None:
+    """In words, that a CT is too dark for HU by the intercept of its scanner; None where it is not.
+
+    Much of it is darker than air, and hardly anything is as dense as soft tissue. What fills the corners of a CT is
+    that dark too, but then there is soft tissue.
+    """
+    some = ct.data[_steps(ct, _MEDIANS_MM)]
+    dark = float((some < _DARKER_THAN_AIR_HU).float().mean())
+    soft = float(((some > _SOFT_HU[0]) & (some < _SOFT_HU[1])).float().mean())
+    if dark < _MOST_SO_DARK or soft > _LEAST_SOFT:
+        return None
+    return (
+        f"{dark:.0%} of the CT has less than {_DARKER_THAN_AIR_HU:g} HU, and air has −1000; {soft:.0%} is as dense as "
+        "soft tissue: is the intercept of the scanner's rescale applied twice?"
     )
 
 

@@ -5,6 +5,7 @@ import torch
 from scipy import ndimage
 
 from femoreg_torch.volume import Volume, axis_aligned, densities, misplaced_labels, shifted_labels, soft_bones
+from femoreg_torch.volume.contradictions import intercept_twice
 
 IDS = (1, 2)
 NAMES = {"hip_left": 1, "femur_left": 2}
@@ -153,3 +154,21 @@ def test_a_few_voxels_of_a_bone_say_nothing() -> None:
     few = torch.zeros_like(labels.data)
     few[60, 20, 70:74] = 2
     assert soft_bones(ct, labels.with_data(few), {"femur_left": 2}) is None
+
+
+@pytest.mark.parametrize("clipped", [True, False])
+def test_an_intercept_that_was_applied_twice_is_named(clipped: bool) -> None:
+    """And neither padding about a patient nor a bone in air is taken for that."""
+    place = torch.meshgrid(*[torch.arange(60.0) - 30] * 3, indexing="ij")
+    noise = 20 * torch.randn(60, 60, 60, generator=torch.Generator().manual_seed(0))
+    body, bone = place[1].hypot(place[2]) < 22, place[1].hypot(place[2]) < 6
+    hu = torch.where(bone, 500.0, torch.where(body, 40.0, -1000.0)) + noise
+    hu = hu.clamp_min(-1024) if clipped else hu
+    affine = axis_aligned((3.0, 3.0, 3.0), (0, 0, 0))
+    assert intercept_twice(Volume(hu, affine)) is None
+    told = intercept_twice(Volume(hu - 1024, affine))
+    assert told is not None
+    assert "applied twice" in told
+    corners = place[1].hypot(place[2]) > 29
+    assert intercept_twice(Volume(torch.where(corners, -2000.0, hu), affine)) is None
+    assert intercept_twice(Volume(torch.where(bone, hu, -1000.0), affine)) is None
