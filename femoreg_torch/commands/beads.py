@@ -57,6 +57,8 @@ def beads(case: Path, *, beads: Path, out: Path, run: Path | None = None) -> Non
     for name, row in deviations.items():
         along = ", ".join(f"{axis} {mm:.2f}" for axis, mm in zip(("IS", "LR", "AP"), row["mm_xyz"], strict=True))
         console.print(f"{name}: known to {row['mm']:.2f} mm ({along}) and {row['deg']:.2f}°.")
+    if deviations:
+        console.print("These hold for a C-arm that is as its file says: a wrong source distance is not in them.")
     console.print(f"The case without beads, and its truth: {escape(str(out))}")
 
 

@@ -13,6 +13,7 @@ _CLOSER_MM, _FAR_MM = 2.0, 30.0
 _ON_MM, _OFF_MM = 2.0, 6.0  # so near to a bone a landmark lies on it, and so far away it does not
 _ACROSS_MM = 12.0  # labels leak across a symphysis or into a joint by less
 _BESIDE_MM = 5.0  # seen of 17 right cases: at most 1.3; those that people place are 2 to 3 mm off
+_MM_PER_CM = 10.0
 _METRES_MM = 2.0  # no patient is so small, and none lies farther from a scanner's middle in metres
 _RAS = torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64)
 
@@ -81,6 +82,12 @@ def stray_landmarks(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy:
         return [
             f"landmarks: {', '.join(stray)} lie on no bone, but would with x and y negated: the file holds RAS and "
             "says LPS, or the other way round. Correct its coordinate system"
+        ]
+    longer, _ = _votes(bones, {name: landmarks[name] * _MM_PER_CM for name in stray}, anatomy)
+    if 2 * len(longer) > len(stray):
+        return [
+            f"landmarks: {', '.join(stray)} lie on no bone, but would ten times as far from the origin: are they in "
+            "cm? Multiply them by 10"
         ]
     if len(stray) == len(asked) > 1 and max(float(landmarks[name].abs().max()) for name in stray) < _METRES_MM:
         return [

@@ -104,6 +104,11 @@ def metres(c: Content, folder: Path) -> None:
     (folder / "landmarks.mrk.json").write_text(markups(points), encoding="utf-8")
 
 
+def centimetres(c: Content, folder: Path) -> None:
+    points = {name: tuple(v / 10 for v in point) for name, point in landmarks().items()}
+    (folder / "landmarks.mrk.json").write_text(markups(points), encoding="utf-8")
+
+
 def masked(c: Content, folder: Path) -> None:
     cv2.imwrite(str(folder / "mask.png"), np.eye(20, dtype=np.uint8))
     c["views"][1].update(field="mask.png")
@@ -323,7 +328,8 @@ def test_the_registration_refuses_swapped_sides_and_tells_what_was_done_to_a_lab
     [
         ({"MOF-l": "MOF-r", "MOF-r": "MOF-l"}, "MOF-l, MOF-r lie on the other side. Exchange"),
         ({"GSN-r": "GSN-l"}, "GSN-r lies on the other side. Exchange"),
-        (0.1, "lie far from the bones"),  # in cm
+        (0.1, "are they in cm"),
+        (0.4, "lie far from the bones"),
     ],
 )
 def test_the_registration_refuses_landmarks_on_other_bones(
@@ -346,6 +352,7 @@ def test_the_registration_refuses_landmarks_on_other_bones(
 @pytest.mark.parametrize(
     ("change", "told"),
     [
+        (centimetres, r"landmarks: .* lie on no bone, but would ten times as far from the origin: are they in cm\?"),
         (metres, r"landmarks: FH-l, .* lie within 2 mm of the origin: are they in metres\?"),
         (lambda c, f: c.update(version="2"), r"version: .* found '2'\. Take the quotes away"),
     ],
