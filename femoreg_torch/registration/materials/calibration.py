@@ -44,7 +44,13 @@ class Calibration:
                 told.append(f"{name} not estimated, as it would have moved by {deg:.0f}° and {mm:.0f} mm")
                 continue
             unsure = tuple(difference.to(scene.device) for difference in fit.unsure)
-            found = replace(thing, volume=fit.volume.to(scene.device), hardening=fit.hardening, unsure=unsure)
+            found = replace(
+                thing,
+                volume=fit.volume.to(scene.device),
+                hardening=fit.hardening,
+                unsure=unsure,
+                materials_known=fit.as_told,  # one material may be named for a device of several
+            )
             objects = scene.objects | {name: found}
             scene = replace(scene, objects=objects, scatter=scene.scatter or fit.scatter)
             poses = poses.with_object(name, fit.camera1_from)

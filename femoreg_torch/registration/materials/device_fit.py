@@ -61,6 +61,7 @@ class DeviceFit:
     evaluations: int
     unsure: tuple[Volume, ...]  # see `RigidObject`: blocks at the borders of materials, taken for the wrong one
     hardening: float  # of the beam, see `imaging.hardened`
+    as_told: bool = False  # whether its materials are those that were named, by which it was drawn
 
 
 def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit | None:
@@ -104,6 +105,7 @@ def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit |
         evaluations + used,
         () if borders is None else mistakes(share, borders, attenuation),
         hardening_of(fit),
+        thing.materials_known and (as_named or len(thing.parts) > 1),
     )
 
 

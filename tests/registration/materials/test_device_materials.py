@@ -185,6 +185,16 @@ def test_a_device_that_is_as_the_case_says_stays_so() -> None:
     assert "/mm" in record.stop
 
 
+@pytest.mark.parametrize(("dense", "named", "known"), [(0.15, True, True), (0.15, False, False), (METAL, True, False)])
+def test_materials_are_known_where_they_were_named_and_the_images_agree(dense: float, named: bool, known: bool) -> None:
+    """A device of which users name one material may have a handle of another."""
+    scene = make_scene(dense, 0.15 if dense == 0.15 else LIGHT)
+    device = replace(scene.objects["device"], materials_known=named)
+    scene = replace(scene, objects=scene.objects | {"device": device})
+    after, _ = Calibration("materials").calibrate(scene, poses())
+    assert after.objects["device"].materials_known == known
+
+
 def test_saturated_pixels_tell_nothing_of_a_part_before_them() -> None:
     """The handle lies before open air in two views, where both images are as bright as the detector goes."""
     scene = make_scene(METAL, LIGHT, tissue_from=-5.0, brightest=0.4)
@@ -228,6 +238,7 @@ def test_named_parts_keep_their_bounds(mixed: Scene) -> None:
     named = replace(mixed.objects["device"], volume=total, parts=parts, materials_known=True)
     fit = fit_device(replace(mixed, objects=mixed.objects | {"device": named}), poses(), "device", "device")
     assert fit is not None
+    assert fit.as_told
     assert len(fit.attenuations) == 2
     assert fit.attenuations[1] == pytest.approx(LIGHT, rel=0.2)
     assert fit.attenuations[0] > 0.4
