@@ -13,10 +13,10 @@ from femoreg_torch.registration.scene import Scene
 # Of the mean patch Grad-NCC. Seen on simulated procedures: mirror images fit worse by 0.01 to 0.06; where the CT was
 # mirrored, better by 0.04.
 _BETTER_MIRRORED = 0.005
-# Of the ends of an object, were it cut, on average over the end that moves less: of a model, and of a bone, whose CT
-# and label map err. Seen of 47 right procedures, with shutters, dark images and parts of the table too: at most 0.8 and
-# 1.05 mm. Of devices bent by 2 mm or 5°, eleven of twelve 1.0 to 2.8 mm; of four broken femora 1.1 to 11 mm.
-_MOST_APART_MM, _MOST_APART_OF_BONE_MM, _SURE_OF_BEND = 1.0, 1.5, 4.0
+# Of the ends of a bone, whose CT and label map err, were it cut: on average over the end that moves less. Seen of 47
+# right procedures, with shutters, dark images and parts of the table too: at most 1.05 mm; of four broken femora 1.1 to
+# 11 mm.
+_MOST_APART_OF_BONE_MM, _SURE_OF_BEND = 1.5, 4.0
 # By their standard deviation: 8.6 and more of three of those femora; a right one, behind shutters, on images of another
 # simulator was 1.9 mm and 2.7 deviations apart.
 _SURE_OF_BREAK = 4.0
@@ -34,10 +34,11 @@ _GAIN_OF_A_TURNED_END = 0.0018
 # apart where that gained anything. A wire that was bowed by 4 mm was 0.6 and 1.1 mm apart, by 8.9 and 5.5 deviations,
 # and gained 0.0003.
 _MOST_APART_OF_KNOWN_MM, _SURE_OF_A_KNOWN_BEND = 0.5, 5.0
-# Of a model whose materials are estimated: less is believed. On images of three other simulators six right devices
-# seemed 1.1 to 5.4 mm apart, by 4.5 to 6.2 deviations and gains of 0.0003 to 0.0025; five bent ones gained 0.0014 to
-# 0.005, by 8.5 to 18.
-_GAIN_OF_A_BENT_MODEL, _SURE_OF_A_BENT_MODEL = 0.0005, 7.0
+# Of a model whose materials are estimated: less is believed, and an end's turn that no image tells is left out at once.
+# On images of four other simulators 20 right devices gained at most 0.0005, and the ends of some seemed 1 to 5 mm
+# apart, by 6.6 deviations at most; one whose hub hardly any view told gained 0.0025, by 6.2. Bent and kinked ones were
+# 0.8 to 2.8 mm apart and gained 0.0007 to 0.005, by 8.5 to 18.
+_MOST_APART_OF_UNKNOWN_MM, _GAIN_OF_A_BENT_MODEL, _SURE_OF_A_BENT_MODEL = 0.75, 0.0005, 7.0
 
 
 def doubts_about_handedness(told: Scene, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
@@ -87,23 +88,39 @@ def _ends_apart(
     A bone that hardly fits better so is asked without any turn of an end about its long axis as well.
     """
     thing = scene.objects[name]
+    is_model = bool(thing.parts)
 
     def apart(turns: Turns) -> Bend | None:
-        found = bend(scene, poses, name, share, images, turns)
-        return found if found is not None and _is_bent(found, bool(thing.parts), thing.materials_known) else None
+        return bend(scene, poses, name, share, images, turns)
 
-    found = apart("all") and apart("told")
-    if found is None or thing.parts or found.gain > _GAIN_OF_A_TURNED_END:
+    if is_model and not thing.materials_known:
+        freely = apart("all")
+        if freely is None or freely.gain <= _GAIN_OF_A_BENT_MODEL:
+            return None
+        found = apart("told")
+        return found if found is not None and _is_surely_bent(found) else None
+
+    def bent(found: Bend | None) -> Bend | None:
+        return found if found is not None and _is_bent(found, is_model) else None
+
+    found = bent(apart("all")) and bent(apart("told"))
+    if found is None or is_model or found.gain > _GAIN_OF_A_TURNED_END:
         return found
-    return found if apart("none") else None
+    return found if bent(apart("none")) else None
 
 
-def _is_bent(found: Bend, is_model: bool, materials_known: bool) -> bool:
-    most, sure = (_MOST_APART_MM, 1.0) if is_model else (_MOST_APART_OF_BONE_MM, _SURE_OF_BREAK)
-    most = _MOST_APART_OF_KNOWN_MM if materials_known else most
-    apart = found.apart_mm > max(most, sure * found.apart_deviation_mm)
+def _is_surely_bent(found: Bend) -> bool:
+    """Of a model whose materials are estimated."""
+    apart = found.apart_mm > max(_MOST_APART_OF_UNKNOWN_MM, found.apart_deviation_mm)
+    return apart and found.gain > _GAIN_OF_A_BENT_MODEL and found.sureness > _SURE_OF_A_BENT_MODEL
+
+
+def _is_bent(found: Bend, is_model: bool) -> bool:
+    """Of a bone, or of a model whose materials are known."""
+    if is_model:
+        most, deviations, surely = _MOST_APART_OF_KNOWN_MM, 1.0, _SURE_OF_A_KNOWN_BEND
+    else:
+        most, deviations, surely = _MOST_APART_OF_BONE_MM, _SURE_OF_BREAK, _SURE_OF_BEND
+    apart = found.apart_mm > max(most, deviations * found.apart_deviation_mm)
     broken = not is_model and found.gain > _GAIN_OF_BREAK and found.apart_mm > _APART_OF_BREAK_MM
-    sure_of_materials = not is_model or materials_known
-    told = sure_of_materials or (found.gain > _GAIN_OF_A_BENT_MODEL and found.sureness > _SURE_OF_A_BENT_MODEL)
-    surely = found.sureness > (_SURE_OF_A_KNOWN_BEND if materials_known else _SURE_OF_BEND)
-    return broken or (apart and told and surely and found.gain > _LEAST_GAIN_OF_BEND)
+    return broken or (apart and found.sureness > surely and found.gain > _LEAST_GAIN_OF_BEND)
