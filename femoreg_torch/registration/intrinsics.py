@@ -11,7 +11,7 @@ from femoreg_torch.geometry import CameraChange
 from femoreg_torch.optimize import Quadratic
 
 # The penalty that a deviation of one standard deviation adds to the mean patch NCC is half of this. Near a solution the
-# mean patch NCC behaves like a log-likelihood times 2e-5 (R / S of `registration.covariance` over development
+# mean patch NCC behaves like a log-likelihood times 2e-5 (R / S of `registration.evidence.covariance` over development
 # cases), so that the file's word weighs as much as it is worth against images, and counts where they say nothing.
 PRIOR_WEIGHT = 2e-5
 

@@ -5,11 +5,12 @@ that is not where it is drawn explains little of the image. Second, where each v
 object in its own image plane: views that pull in different directions contradict each other, or their common geometry.
 Third, where all views together would move it beside the anchor, and the anchor itself, were everything free: what a
 stage held in a wrong place, the C-arm, say, moves then. Fourth, the standard deviations of the pose
-(`registration.covariance`), depth included. Neither asks a round model for its turn about its own axis
+(`registration.evidence.covariance`), depth included. Neither asks a round model for its turn about its own axis
 (`registration.roundness`). Fifth, how far it lies from where it was expected. Sixth, whether other starts of a stage
 ended elsewhere and fitted as well. Seventh, how far what is not known of the C-arm's source distance and principal
 points leaves it open beside the other objects; and of the C-arm itself, whether the images fit other intrinsics than
-its file says. Eighth, of a device, whether the images tell its turn about its long axis (`registration.turns`).
+its file says. Eighth, of a device, whether the images tell its turn about its long axis and its guide
+(`registration.evidence.turns`).
 """
 
 import math

@@ -19,7 +19,7 @@ P + (m − q0)(m − q0)ᵀ in the mean square, and the covariance of the poses 
 intrinsics that were refined count with what the images leave open, and others also with how badly the images fit them.
 
 Where the materials of a device were estimated, some of it is taken for what lies beside it
-(`registration.device_fit`). These mistakes are nuisance parameters m too, with covariance 1. What the
+(`registration.materials.device_fit`). These mistakes are nuisance parameters m too, with covariance 1. What the
 images say of them, the calibration has used already, so they add Hxx⁻¹ Hxm Hmx Hxx⁻¹.
 """
 

@@ -5,8 +5,8 @@ had not turned in its joint, and the device had been held still. The images tell
 one of its bones, move by a rigid motion y in the images of another kind than the first, in all views at once (the
 patient moved) or in one alone (the C-arm did not come back), or let the device, or a bone beside the scene's anchor,
 move in one view, and let everything else be refitted. With curvature and scores profiled as those of the intrinsics are
-(`registration.covariance`), the step of Newton is −S⁻¹ Σ r, and its covariance that of the sandwich estimator over
-tiles, S⁻¹ R S⁻¹.
+(`registration.evidence.covariance`), the step of Newton is −S⁻¹ Σ r, and its covariance that of the sandwich estimator
+over tiles, S⁻¹ R S⁻¹.
 """
 
 from collections.abc import Sequence
