@@ -5,8 +5,8 @@ as the larger part of it, and neither one view nor all together ask for another 
 long axis, the images would move its ends apart.
 
 The shaft of a long bone is nearly round. Derivatives do not say that no image tells its turn about its long axis
-(`registration.evidence.turns`): what the voxels draw, and a pin that crosses it, turned such an end by 17°. So ends that
-seem to lie apart are asked again, without the turns of an end about its long axis that it may go on by for nearly
+(`registration.evidence.turns`): what the voxels draw, and a pin that crosses it, turned such an end by 17°. So ends
+that seem to lie apart are asked again, without the turns of an end about its long axis that it may go on by for nearly
 nothing. A bone whose ends lie apart by such a turn alone is asked without any of them.
 """
 
