@@ -41,7 +41,7 @@ class RigidObject:
     parts: tuple[Volume, ...] = ()
     axis: Axis | None = None  # of a model that is round, as it was told
     guide: tuple[Tensor, Tensor] | None = None  # base and tip (3,), mm, of a tool
-    materials_known: bool = False  # whether materials were named; the HU of a single solid may be a guess
+    materials_known: bool = False  # whether materials were named and the images, once asked, agree; HU may be a guess
     sharp: bool = False  # whether it is made of solids with surfaces, over which its voxels average
     hardening: float = 0.0  # of the beam in it, see `registration.imaging.hardened`
     # differences of attenuation, 1/mm, of what was estimated: each comes in with an amount of mean 0 and variance 1

@@ -22,10 +22,10 @@ _GAIN_OF_DRIFT, _GAIN_OF_SURE_DRIFT = 0.002, 0.001
 # measured as 0.7 to 1.4 mm, by 5 deviations and more, and gained 0.0016; turns of 4 to 8° as 2.5 to 5°, by 1.5 to 2.9
 # deviations, and gained 0.0005.
 _MOST_SLIDE_MM, _SURE_OF_SLIDE, _GAIN_OF_SLIDE = 0.6, 3.0, 0.0003
+_MOST_TURN_DEG, _SURE_OF_TURN, _GAIN_OF_TURN = 2.0, 1.2, 0.0003
 # Of a slide that explains more, less sureness is asked: one of 2 mm in a view that looks nearly along the guide was
 # measured as 1.9 mm by 1.3 deviations, and gained 0.0008.
 _FAR_SLIDE_MM, _SURE_OF_FAR_SLIDE, _GAIN_OF_FAR_SLIDE = 1.0, 1.0, 0.0006
-_MOST_TURN_DEG, _SURE_OF_TURN, _GAIN_OF_TURN = 2.0, 1.2, 0.0003
 # Of a bone in one view, beside the others. Where a leg had turned by 1.8° from view to view: 0.018, and where a neck
 # had broken 0.0029 and more. Of 16 right ones of two simulators, with bad CTs, shutters and metal too: at most 0.0007,
 # of nine of a third at most 0.0029.
@@ -101,15 +101,13 @@ def doubts_about_joints(covariance: PoseCovariance) -> tuple[str, ...]:
 def doubts_about_guides(covariance: PoseCovariance, limits: Limits) -> tuple[str, ...]:
     """A tool that slid along its guide or turned about it in one view, in words: what explains the images best.
 
-    Where the images leave its rotation open by more than is trusted, as its quality says, a turn in one view means
-    nothing more.
+    A turn is passed over where the images leave the tool's rotation open by more than is trusted: its quality says so.
     """
-    moved = [each for each in covariance.guide_drifts if _has_drifted_along(each)]
-    moved = [
-        each
-        for each in moved
-        if not each.turns or largest(covariance.by_images(each.name)[0]) <= limits.most_deviation_deg
-    ]
+
+    def may_mean_something(found: GuideDrift) -> bool:
+        return not found.turns or largest(covariance.by_images(found.name)[0]) <= limits.most_deviation_deg
+
+    moved = [each for each in covariance.guide_drifts if _has_drifted_along(each) and may_mean_something(each)]
     if not moved:
         return ()
     found = max(moved, key=lambda each: each.gain)

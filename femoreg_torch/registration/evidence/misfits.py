@@ -58,7 +58,7 @@ class Misfit:
     similarity: float  # mean patch Grad-NCC, at most 1
     in_view_1: float  # of the first image of view 1
     as_view: int | None = None  # (from 0) whose pose explains it
-    as_stored: str | None = None  # what was to be done to it so that a pose along the orbit explains it
+    as_stored: str | None = None  # what was to be done to it so that it fits
 
 
 def misfits(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[Misfit, ...]:
@@ -94,7 +94,7 @@ def _explained(
     kind, view = image
     found = Misfit(kind, view, fits[image], fits[scene.first_kind, 0])
     if kind != scene.first_kind:
-        return _explained_where_its_view_is(scene, poses, found, imaging)
+        return _explained_at_known_view(scene, poses, found, imaging)
     if scene.camera_from_camera1 is not None or view == 0:
         return found
     ways = _ways(scene, kind, view)
@@ -111,7 +111,7 @@ def _explained(
     return found
 
 
-def _explained_where_its_view_is(scene: Scene, poses: Poses, found: Misfit, imaging: Imaging) -> Misfit:
+def _explained_at_known_view(scene: Scene, poses: Poses, found: Misfit, imaging: Imaging) -> Misfit:
     """An image whose view the other one places: does it show another view, or was it stored otherwise?"""
     kind, view = found.kind, found.view
     others = [other for other in range(scene.views) if other != view]

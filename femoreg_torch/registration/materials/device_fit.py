@@ -61,7 +61,7 @@ class DeviceFit:
     evaluations: int
     unsure: tuple[Volume, ...]  # see `RigidObject`: blocks at the borders of materials, taken for the wrong one
     hardening: float  # of the beam, see `imaging.hardened`
-    as_told: bool = False  # whether its materials are those that were named, by which it was drawn
+    as_told: bool  # whether its materials were named, and the images agree
 
 
 def fit_device(scene: Scene, poses: Poses, name: str, kind: Kind) -> DeviceFit | None:
