@@ -11,7 +11,7 @@ from femoreg_torch.volume.materials import DENSITIES
 MODEL_KEYS = ("model", "volume", "labels", "hu", "material", "parts")
 _VOLUME_SUFFIXES = (".nii", ".nii.gz", ".nrrd", ".nhdr", ".mha", ".mhd")
 _AIR_HU, _MOST_HU = -1000.0, 1e6  # tungsten, the densest that devices have parts of, has some 350,000
-_BODIES_SUFFIXES = (".3mf", ".obj", ".glb")  # of files that hold several bodies with names
+BODIES_SUFFIXES = (".3mf", ".obj", ".glb", ".step", ".stp")  # of files that hold several bodies with names
 
 
 def is_model(entry: Fields) -> bool:
@@ -41,9 +41,9 @@ def _bodies(entry: Fields, folder: Path) -> tuple[Part, ...]:
     """The bodies by name of the one file under `model`."""
     _without(entry, "volume", "labels", "hu", "material")
     path = entry.file_path("model", folder)
-    if not path.name.lower().endswith(_BODIES_SUFFIXES):
+    if not path.name.lower().endswith(BODIES_SUFFIXES):
         raise InputError(
-            f"{entry.where('model')}: {path.name} has no bodies with names ({', '.join(_BODIES_SUFFIXES)} have). Give "
+            f"{entry.where('model')}: {path.name} has no bodies with names ({', '.join(BODIES_SUFFIXES)} have). Give "
             "`parts` as a list with a file each."
         )
     bodies = entry.mapping("parts")

@@ -153,7 +153,7 @@ def new_case(
             femoral head (FH).
         plan: Planned path: a line of 3D Slicer, or points `entry` and `target`; without a target, the femoral head.
         side: Operated side; by default that of the femur which the entry point lies on.
-        device: CAD model (STL, PLY, OBJ, 3MF, GLB), mm. Left out: a case without a device.
+        device: CAD model (STL, PLY, OBJ, 3MF, GLB, STEP), mm. Left out: a case without a device.
         device_points: Its points tip, base and center, in its own space: 3D Slicer markups or JSON. Without `center` it
             is the middle of its box.
         material: What the device is made of: steel, titanium, cobalt chromium, aluminium, peek or pmma.

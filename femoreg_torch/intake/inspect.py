@@ -12,6 +12,7 @@ from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, bone_of_name, fitting_tables
 from femoreg_torch.case import read_case
+from femoreg_torch.case.models import BODIES_SUFFIXES
 from femoreg_torch.case.reading import CASE_NAME
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Frames, nearest_side, read_stored
@@ -26,6 +27,7 @@ from femoreg_torch.intake.volumes import (
 from femoreg_torch.paths import check_readable
 from femoreg_torch.volume import (
     Volume,
+    body_names,
     has_names,
     is_in_ras,
     read_label_map,
@@ -284,10 +286,12 @@ def _sides_of(marks: Mapping[str, Tensor]) -> list[str]:
 def _mesh(path: Path) -> Findings:
     mesh = read_mesh(path)
     low, high = mesh.bounds
-    facts = (
+    facts = [
         f"{len(mesh.faces)} triangles, closed, {abs(float(mesh.volume)) / 1000:.2f} ml",
         f"from ({', '.join(f'{v:.1f}' for v in low)}) to ({', '.join(f'{v:.1f}' for v in high)}) mm",
-    )
+    ]
+    if path.suffix.lower() in BODIES_SUFFIXES and len(bodies := body_names(path)) > 1:
+        facts.append(f"bodies: {', '.join(bodies)}. A case may name the material of each under `parts`")
     warnings = []
     if is_in_ras(path):
         warnings.append("the file says RAS: 3D Slicer shows it turned against its coordinates. Export it anew as LPS")
@@ -295,7 +299,7 @@ def _mesh(path: Path) -> Findings:
         bounds_of([mesh], str(path))
     except InputError as error:
         warnings.append(str(error).rstrip("."))
-    return Findings("mesh", facts, tuple(warnings))
+    return Findings("mesh", tuple(facts), tuple(warnings))
 
 
 def _transform(path: Path) -> Findings:

@@ -10,7 +10,7 @@ from femoreg_torch.volume.guide_end import GuideEnd, guide_end
 from femoreg_torch.volume.labels import label_box_centre, looked_up
 from femoreg_torch.volume.landmarks import check_inside, read_landmarks, read_path_points, write_landmarks
 from femoreg_torch.volume.mesh import check_closed, voxelise_mesh
-from femoreg_torch.volume.mesh_files import bounds_of, is_in_ras, read_bodies, read_mesh
+from femoreg_torch.volume.mesh_files import body_names, bounds_of, is_in_ras, read_bodies, read_mesh
 from femoreg_torch.volume.patient import NOBODY, Patient
 from femoreg_torch.volume.reading import (
     read_ct,
@@ -43,6 +43,7 @@ __all__ = [
     "Volume",
     "axis_aligned",
     "bone_labels",
+    "body_names",
     "bounds_of",
     "changes_in_place",
     "check_closed",

@@ -14,11 +14,12 @@ from femoreg_torch.arrays import opened, quiet
 from femoreg_torch.errors import InputError, in_mm
 from femoreg_torch.paths import check_readable
 from femoreg_torch.volume.mesh import check_closed
+from femoreg_torch.volume.step_files import STEP_SUFFIXES, glb_of_step
 
 if TYPE_CHECKING:
     import trimesh
 
-_SUFFIXES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb")
+_SUFFIXES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb", *STEP_SUFFIXES)
 _MOST_UNZIPPED = 2**29  # bytes of all that a 3MF file holds
 _SHORTEST_MM, _LONGEST_MM = 5.0, 2000.0  # of a device; beyond them the file is likely in metres, inches or µm
 _SAME_DECIMALS = 4  # of corners in mm
@@ -26,7 +27,7 @@ _FARTHEST_MM = 1e6  # of a corner from the origin
 
 
 def read_mesh(path: Path) -> "trimesh.Trimesh":
-    """A closed surface in mm from an STL, PLY, OBJ, OFF, 3MF or GLB file, equal vertices merged.
+    """A closed surface in mm from an STL, PLY, OBJ, OFF, 3MF, GLB or STEP file, equal vertices merged.
 
     Bodies of a file that holds several are taken together, one that stands there twice once. Raises `InputError`.
     """
@@ -39,15 +40,13 @@ def read_mesh(path: Path) -> "trimesh.Trimesh":
 
 
 def read_bodies(path: Path, names: Sequence[str]) -> "dict[str, trimesh.Trimesh]":
-    """The closed bodies in mm of a 3MF, GLB or OBJ file by name, in the order of `names`.
+    """The closed bodies in mm of a 3MF, GLB, STEP or OBJ file by name, in the order of `names`.
 
     Bodies of an OBJ file are its objects, or its groups where it has not more than one object. Raises `InputError`
     unless `names` are those of all bodies of the file.
     """
     path = Path(path)
-    bodies = _load(path, split_objects=True, split_groups=False)
-    if path.suffix.lower() == ".obj" and len(bodies) == 1:
-        bodies = _load(path, split_objects=False, split_groups=True)
+    bodies = _named(path)
     unknown = [name for name in names if name not in bodies]
     unnamed = [name for name in bodies if name not in names]
     if unknown or unnamed:
@@ -57,6 +56,19 @@ def read_bodies(path: Path, names: Sequence[str]) -> "dict[str, trimesh.Trimesh]
             f"{path}: {' and '.join(wrong)}. Name each body once under `parts`; the file has: {', '.join(bodies)}."
         )
     return {name: check_closed(bodies[name], f"{path}, body {name}") for name in names}
+
+
+def body_names(path: Path) -> tuple[str, ...]:
+    """Names of the bodies that `read_bodies` finds in a mesh file, by the alphabet. Raises `InputError`."""
+    return tuple(sorted(_named(Path(path))))
+
+
+def _named(path: Path) -> "dict[str, trimesh.Trimesh]":
+    """The bodies of a file by name; those of an OBJ file are its objects, or its groups if it has but one object."""
+    bodies = _load(path, split_objects=True, split_groups=False)
+    if path.suffix.lower() == ".obj" and len(bodies) == 1:
+        bodies = _load(path, split_objects=False, split_groups=True)
+    return bodies
 
 
 def _each_once(bodies: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
@@ -85,7 +97,7 @@ def bounds_of(meshes: "Sequence[trimesh.Trimesh]", where: str) -> np.ndarray:
     if not _SHORTEST_MM <= longest <= _LONGEST_MM:
         raise InputError(
             f"{where}: its longest edge is {in_mm(longest)}, but a device has {_SHORTEST_MM:g} to {_LONGEST_MM:g} mm. "
-            "The file is to be in mm (a GLB in metres, a 3MF in the unit that it names)."
+            "The file is to be in mm (a GLB in metres, a 3MF or STEP in the unit that it names)."
         )
     return bounds
 
@@ -101,8 +113,6 @@ def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, tri
     import trimesh  # takes most of a second, which reading of the CT hides
 
     check_readable(path)
-    if path.suffix.lower() in (".step", ".stp"):
-        raise InputError(f"{path}: is a STEP file. Export it as STL, or as 3MF if it has several bodies.")
     if path.suffix.lower() not in _SUFFIXES:
         raise InputError(f"{path}: a mesh ({', '.join(_SUFFIXES)}) was expected.")
     options: dict[str, Any] = {}
@@ -112,18 +122,28 @@ def _load(path: Path, split_objects: bool, split_groups: bool) -> "dict[str, tri
         with quiet():
             if path.suffix.lower() == ".3mf":
                 _check_3mf(path)
-            text = _text(path)
-            source = path if text is None else BytesIO(text.encode())
-            scene = trimesh.load_scene(source, file_type=path.suffix[1:].lower(), process=False, **options)
+            source, kind = _source(path)
+            scene = trimesh.load_scene(source, file_type=kind, process=False, **options)
             bodies = _bodies(scene, path)
     except InputError:
         raise
     except Exception as error:  # trimesh's readers raise whatever their parsing runs into
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InputError(f"{path}: cannot be read as a mesh (STL, PLY, OBJ, OFF, 3MF or GLB): {reason}.") from error
+        raise InputError(
+            f"{path}: cannot be read as a mesh (STL, PLY, OBJ, OFF, 3MF, GLB or STEP): {reason}."
+        ) from error
     if not bodies:
         raise InputError(f"{path}: the mesh holds no triangle.")
     return bodies
+
+
+def _source(path: Path) -> tuple[Path | BytesIO, str]:
+    """What trimesh reads for a file, and as which format. Raises `InputError`."""
+    suffix = path.suffix[1:].lower()
+    if path.suffix.lower() in STEP_SUFFIXES:
+        return BytesIO(glb_of_step(path)), "glb"
+    text = _text(path)
+    return (path if text is None else BytesIO(text.encode())), suffix
 
 
 def _text(path: Path) -> str | None:
@@ -194,8 +214,9 @@ def _bodies(scene: "trimesh.Scene", path: Path) -> "dict[str, trimesh.Trimesh]":
 
     mm = 1.0 if scene.units is None else trimesh.units.unit_conversion(scene.units, "mm")
     bodies = {}
-    for name in sorted(scene.graph.nodes_geometry):
-        place, geometry = scene.graph[name]
+    for node in sorted(scene.graph.nodes_geometry):
+        place, geometry = scene.graph[node]
+        name = str(geometry if node.startswith("=>[") else node)  # a place in a STEP assembly that has no name
         surface = scene.geometry[geometry]
         if not isinstance(surface, trimesh.Trimesh):
             raise InputError(f"{path}: triangle meshes were expected, found {type(surface).__name__}.")

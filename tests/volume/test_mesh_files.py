@@ -119,12 +119,6 @@ def test_a_corner_that_lacks_a_coordinate(tmp_path: Path) -> None:
         read_mesh(tmp_path / "device.obj")
 
 
-def test_step_says_what_to_export(tmp_path: Path) -> None:
-    (tmp_path / "device.STEP").write_text("ISO-10303-21;", encoding="utf-8")
-    with pytest.raises(InputError, match=r"device\.STEP: is a STEP file\. Export it as STL, or as 3MF"):
-        read_mesh(tmp_path / "device.STEP")
-
-
 @pytest.mark.parametrize("change", [-25, 7])
 def test_a_binary_stl_that_is_cut_off_or_too_long_is_told(tmp_path: Path, change: int) -> None:
     trimesh.creation.box((10, 10, 60)).export(tmp_path / "device.stl")
