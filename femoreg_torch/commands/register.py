@@ -92,7 +92,7 @@ def register(
         quoted = quoted_gain(response, result)
         if quoted is not None:
             console.print(quoted.sentence)
-    for line in [] if navigation is None else summary(navigation):
+    for line in [] if navigation is None else summary(navigation, result.verdict.reasons):
         console.print(line)
     console.print(f"Result written to {escape(str(out / RESULT_NAME))} ({result.timings_s['total']:.0f} s).")
     return NOT_TRUSTED if require_trust and not result.verdict.trusted else 0

@@ -1,6 +1,7 @@
 """Guidance as the content of `navigation.json`, and in a few words for people."""
 
 import math
+from collections.abc import Collection
 from typing import Any
 
 from rich.markup import escape
@@ -78,8 +79,8 @@ def navigation_content(result: Result, robot: Robot | None) -> dict[str, Any]:
     return content
 
 
-def summary(content: dict[str, Any]) -> list[str]:
-    """Lines for a terminal, with rich's markup, from what `navigation_content` gives."""
+def summary(content: dict[str, Any], told: Collection[str] = ()) -> list[str]:
+    """Lines for a terminal, with rich's markup, from what `navigation_content` gives; reasons in `told` stand above."""
     tool = content["tool"]
     lines = [
         f"Guide tip {float(content['tip_offset_mm']):.2f} mm from the entry point, guide {content['angle_deg']:.2f}° "
@@ -89,11 +90,11 @@ def summary(content: dict[str, Any]) -> list[str]:
         + (f", {_vector(-content['in_base']['tip_offset'])} mm (robot base)." if "in_base" in content else "."),
     ]
     if not content["trusted"]:
-        reasons = escape("; ".join(content["reasons"]))
+        reasons = escape("; ".join(reason for reason in content["reasons"] if reason not in told))
         by = (
             "the correction" if len(content["reasons"]) == 1 and not content["turn_told"] else "this, it is not trusted"
         )
-        lines.insert(0, f"[bold red]Do not steer by {by}[/]: {reasons}.")
+        lines.insert(0, f"[bold red]Do not steer by {by}[/]{f': {reasons}' if reasons else ''}.")
     return lines
 
 

@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from femoreg_torch.case import Result
+from femoreg_torch.case import Result, read_result
 from femoreg_torch.commands.main import main
 from femoreg_torch.files import read_json, write_json
 from femoreg_torch.geometry import poses_by_object
-from femoreg_torch.navigation import navigation_content, read_robot
+from femoreg_torch.navigation import navigation_content, read_robot, summary
 
 Matrix = NDArray[np.float64]
 
@@ -403,3 +403,12 @@ def test_a_bad_calibration_is_one_line_and_changes_nothing(
     assert told.count("\n") == 1
     assert says in told
     assert [path.name for path in run.iterdir()] == ["result.json"]
+
+
+def test_reasons_that_stand_above_are_not_told_twice(tmp_path: Path) -> None:
+    run, _ = navigated(tmp_path, trusted=False)
+    content = navigation_content(read_result(run), None)
+    reason = "femur: view 2 would move the femur by (3.0, 0.1) mm"
+    assert reason in summary(content)[0]
+    assert summary(content, [reason])[0].endswith("Do not steer by this, it is not trusted[/].")
+    assert summary(content, [reason])[1:] == summary(content)[1:]
