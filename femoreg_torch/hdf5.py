@@ -69,7 +69,7 @@ class Hdf5File:
         return str(self._ask("text", name))
 
     def matrix(self, name: str, shape: tuple[int, ...]) -> Tensor:
-        """Finite numbers of a shape, float64; vectors may stand as a column."""
+        """Finite numbers of this shape, float64; a vector (n,) may stand as a column. Raises `InputError`."""
         return torch.from_numpy(self._ask("matrix", name, shape).copy())
 
     def listed(self, name: str, most: int) -> list[float]:

@@ -237,7 +237,7 @@ def _corners(shape: torch.Size) -> Tensor:
 
 
 def alter_contrast(images: Tensor, settings: AugmentationSettings, generator: Generator) -> Tensor:
-    """Gamma of the grey values between each image's extremes, and rarely an inversion."""
+    """Gamma of the grey values between the extremes of each image (B, H, W), and rarely an inversion; 0 to 1."""
     count = len(images)
     low, high = images.amin((1, 2), keepdim=True), images.amax((1, 2), keepdim=True)
     gamma = _log_uniform(*settings.gamma, (count, 1, 1), generator)

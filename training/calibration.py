@@ -15,7 +15,7 @@ _BINS = 10
 
 
 def reliability(readings: Sequence[Reading]) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Mean confidence, share that is right, and number of landmarks in each of ten equal bins that is not empty.
+    """Mean confidence, share that is right, and number of landmarks of the N bins, of ten, that hold any: (N,) each.
 
     A landmark is right if it is in the image and less than 12.4 mm from where it was found.
     """

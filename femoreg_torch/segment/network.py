@@ -60,7 +60,7 @@ def load_bone_network(path: Path | None = None) -> BoneNetwork:
 
 
 def network_input(hu: Tensor) -> Tensor:
-    """HU as the network sees them: cut to the range of tissue and bone, in units of 400 HU."""
+    """HU, of any shape, as the network sees them: cut to the range of tissue and bone, in units of 400 HU."""
     return hu.clamp(_LOWEST_HU, _HIGHEST_HU) / _UNIT_HU
 
 

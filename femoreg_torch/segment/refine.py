@@ -97,7 +97,7 @@ def refined_labels(ct: Volume, shares: Tensor, grid: Volume, anatomy: Anatomy) -
 
 
 def unrefined_labels(ct: Volume, shares: Tensor, grid: Volume, anatomy: Anatomy) -> Tensor:
-    """As `refined_labels`, from the network alone: the most probable class at each voxel."""
+    """As `refined_labels`, from the network alone: the most probable class at each voxel (Z, Y, X)."""
     labels = torch.zeros(ct.data.shape, dtype=torch.uint8)
     coarse = shares.argmax(0)
     if not bool((coarse > 0).any()):
@@ -289,7 +289,10 @@ def opened_joints(
 def closed_joint_mm2(
     labels: NDArray[np.uint8], hu: NDArray[np.float32], femur: int, hip: int, spacing: NDArray[np.float64]
 ) -> float:
-    """Area over which femur and hip bone touch, or are parted by voxels as bright as bone, so that no gap is seen."""
+    """Area, mm², over which femur and hip bone touch, or only voxels as bright as bone part them: no gap is seen.
+
+    `labels` and `hu` (Z, Y, X) stand on one grid, whose spacing (3,) is in mm along x, y, z.
+    """
     one_box, other_box = (ndimage.find_objects(labels == number, 1)[0] for number in (femur, hip))
     if one_box is None or other_box is None:
         return 0.0
@@ -309,7 +312,7 @@ def closed_joint_mm2(
 
 
 def contact(labels: NDArray[np.uint8], one: int, other: int) -> Mask:
-    """Voxels of either label that share a face with the other."""
+    """Voxels (Z, Y, X) of either label that share a face with the other."""
     first, second = labels == one, labels == other
     if not (first.any() and second.any()):
         return np.zeros(labels.shape, bool)

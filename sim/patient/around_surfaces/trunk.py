@@ -38,7 +38,10 @@ def measure_trunk(bones: Surfaces, pelvic_frame: Points) -> Trunk:
 
 
 def thigh_outline(femur: trimesh.Trimesh, z: NDArray[np.floating]) -> tuple[Points, Points, Points, Points]:
-    """Inner, outer, middle-of-depth and half-depth of one thigh at the heights `z`, mm; x counts from the midline."""
+    """Inner and outer edge, middle and half of the depth of one thigh at the heights `z` (N,): (N,) each, mm.
+
+    Edges count along x from the midline.
+    """
     vertices = femur.vertices
     levels = np.arange(-240, -75, 10)
     at = np.array([vertices[np.abs(vertices[:, 2] - level) < 6].mean(0) for level in levels])

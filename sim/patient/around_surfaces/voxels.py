@@ -52,7 +52,7 @@ def _count_crossings(triangles, crossings, tolerance):  # type: ignore[no-untype
 
 
 def block_mean(values: NDArray[np.generic], factor: int = 2) -> Array:
-    """Averages over blocks of `factor` voxels along each axis."""
+    """Averages of a volume (X, Y, Z) over blocks of `factor` voxels along each axis, float32."""
     x, y, z = (n // factor for n in values.shape)
     mean: Array = values.reshape(x, factor, y, factor, z, factor).mean((1, 3, 5), dtype=np.float32)
     return mean
