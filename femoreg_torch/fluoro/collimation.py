@@ -25,16 +25,18 @@ _LEVELS = 20  # tried as the grey value that parts shadow and field
 _LEAST_SHADOW, _LEAST_FIELD = 0.02, 0.04  # shares of the detector
 _LEAST_CORNERS = 3  # of the detector that a circle, or two blades, put in the dark
 _LEAST_WHOLE = 0.7  # of what is no shadow: one piece; dense bone may cut off others
-_MOST_SIDES = 4
+_MOST_SIDES = 8  # of an iris
+_BLADES = 4  # of a collimator without one
 _MOST_POINTS = 800  # of an edge
 _TRIES = 150  # random circles or lines
 _TOLERANCE_MM = 1.0  # of edge points from a circle or line
+_ROUNDER = 3  # times as many edge points lie on a circle as on a line; on that across the sides of an octagon, 1.3
 _LEAST_SHARE = 0.06  # of the edge points: what fewer lie on is no side
 _LEAST_DARK = 0.97  # of what lies beyond a side; the rest may be letters
 _NEAR_MM, _FAR_MM = 3.0, 6.0  # from the edge: where grey values on both sides of it are taken
 _MOST_RATIO = 0.45  # of the grey value beyond the edge to that inside
 _LEAST_SHARP = 0.75  # share of the edge that is as dark and as sharp; an instrument may cross the rest
-_SHARP_ENOUGH = 0.97  # to try no other grey value
+_SHARP_ENOUGH = 0.985  # to try no other grey value
 _MOST_RESIDUAL_MM = 0.7
 _SAME_WAY = 0.9  # cosine between the normals of one blade found twice
 _LEAST_REACH = 0.15  # of a blade from the middle, of half the diagonal
@@ -215,7 +217,9 @@ class _Fit:
     @property
     def name(self) -> str:
         round_, straight = (any(isinstance(side, kind) for side in self.sides) for kind in (_Circle, _Line))
-        return "round and straight" if round_ and straight else "round" if round_ else "rectangular"
+        if round_:
+            return "round and straight" if straight else "round"
+        return "rectangular" if len(self.sides) <= _BLADES else "polygonal"
 
     def inside(self, places: Array) -> Mask:
         """Which places (N, 2) lie in the field."""
@@ -282,10 +286,12 @@ def _with_other_blades(fit: _Fit, image: Array, grid: _Grid) -> _Fit:
     """
     sides = list(fit.sides)
     found = [side for side in sides if isinstance(side, _Line)]
+    if len(found) > _BLADES:
+        return fit
     ways = [way for line in found[:1] for way in (line.normal, -line.normal, line.normal[::-1] * [-1, 1])]
     ways += [-ways[2]] if ways else []
     for normal in ways:
-        if any(line.normal @ normal > _SAME_WAY for line in found) or len(found) == _MOST_SIDES:
+        if any(line.normal @ normal > _SAME_WAY for line in found) or len(found) == _BLADES:
             continue
         reach = float(np.linalg.norm(grid.middle))
         blades = []
@@ -390,7 +396,7 @@ def _best_side(
         apart = _from_lines(chosen, points) if count == 2 else _from_circles(chosen, points, size)
         near = apart <= tolerance  # nan, where points coincide, is not near
         fullest = int(near.sum(1).argmax())
-        if near[fullest].sum() > most.sum():
+        if near[fullest].sum() > most.sum() * (1 if count == 2 else _ROUNDER):
             best, most = (_line_of if count == 2 else _circle_of)(chosen[fullest]), near[fullest]
     if best is not None:
         if isinstance(best, _Line) and best.depth(middle) < 0:

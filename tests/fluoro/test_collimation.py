@@ -57,6 +57,12 @@ def turned(degrees: float, half: tuple[float, float]) -> Polygon:
     return Polygon(tuple((190 + x * cos - y * sin, 193 + x * sin + y * cos) for x, y in ends))
 
 
+def iris(blades: int, radius: float, degrees: float) -> Polygon:
+    """A regular polygon about the middle of the detector."""
+    angles = [math.radians(degrees) + 2 * math.pi * n / blades for n in range(blades)]
+    return Polygon(tuple((190 + radius * math.cos(one), 193 + radius * math.sin(one)) for one in angles))
+
+
 FIELDS: dict[str, tuple[Tensor, str]] = {
     "round": (Circle((185, 200), 150).exposed((SIZE, SIZE)), "round"),
     "ring of an image intensifier": (Circle((191, 191), 196).exposed((SIZE, SIZE)), "round"),
@@ -64,6 +70,12 @@ FIELDS: dict[str, tuple[Tensor, str]] = {
     "rectangle": (turned(0, (150, 120)).exposed((SIZE, SIZE)), "rectangular"),
     "turned rectangle": (turned(25, (140, 120)).exposed((SIZE, SIZE)), "rectangular"),
     "turned rectangle over the border": (turned(10, (140, 260)).exposed((SIZE, SIZE)), "rectangular"),
+    "iris of six blades": (iris(6, 170, 7).exposed((SIZE, SIZE)), "polygonal"),
+    "iris of eight blades": (iris(8, 165, 22.5).exposed((SIZE, SIZE)), "polygonal"),
+    "six blades of all lengths": (
+        Polygon(((25, 40), (190, 8), (365, 31), (372, 346), (173, 376), (15, 346))).exposed((SIZE, SIZE)),
+        "polygonal",
+    ),
     "iris and blades": (
         Circle((190, 190), 170).exposed((SIZE, SIZE)) & turned(0, (110, 300)).exposed((SIZE, SIZE)),
         "round and straight",

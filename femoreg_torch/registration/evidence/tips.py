@@ -40,6 +40,7 @@ class TipLength:
 
     longer_mm: float  # than its model
     gain: float  # of the mean patch Grad-NCC near the tip, by a model of that length
+    cost: float  # 1 − that similarity
 
 
 def tip_length(
@@ -93,7 +94,7 @@ def tip_length(
     best = min(max(min(range(len(found)), key=lambda n: found[n]), 1), len(found) - 2)
     aside = parabola_minimum(*found[best - 1 : best + 2])
     between = 0.0 if math.isnan(aside) else min(max(aside, -1.0), 1.0)
-    return TipLength(lengths[best] + between, found[_LONGEST_MM] - min(found))
+    return TipLength(lengths[best] + between, found[_LONGEST_MM] - min(found), min(found))
 
 
 def _near_the_tip(

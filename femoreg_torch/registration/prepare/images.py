@@ -40,6 +40,8 @@ from femoreg_torch.fluoro import (
 from femoreg_torch.registration.scene import Kind
 from femoreg_torch.volume import NOBODY, patient_of
 
+_BLADE_SHARE = 0.01  # of the detector: what a blade that is missing shades at least
+
 ByKind = dict[Kind, tuple[Tensor | None, ...]]  # something (H, W) of every view
 
 
@@ -65,14 +67,23 @@ def read_images(case: Case) -> tuple[ByKind, ByKind, tuple[str, ...]]:
     shutters = [one.shutter for read in found.values() for one in read if one is not None and one.shutter is not None]
     for kind, read in found.items():
         for index, one in enumerate(read):
-            if one is not None and one.field is None and shutters:
-                read[index] = _read_image(case, index, kind, shutters)
+            others = [] if one is None else _that_may_shade(one, shutters)
+            again = _read_image(case, index, kind, others) if others else None
+            if again is not None and again.shutter is not None:
+                read[index] = again
     images = {kind: tuple(None if one is None else one.attenuation for one in read) for kind, read in found.items()}
     fields = {kind: tuple(None if one is None else one.field for one in read) for kind, read in found.items()}
     _check_different(case, images)
     remarks = [remark for read in found.values() for one in read if one is not None for remark in one.told]
     exposures = [one.exposure for read in found.values() for one in read if one is not None and one.exposure]
     return images, fields, (*remarks, *told, *_told_by_headers(exposures, case.ct_path))
+
+
+def _that_may_shade(image: "_Image", shutters: Sequence[Shutter]) -> list[Shutter]:
+    """Which shutters of other images one may show without that it was found, or whose blades were found but in part."""
+    if image.shutter is None:
+        return list(shutters) if image.field is None else []
+    return [shutter for shutter in shutters if shutter.exposed < image.shutter.exposed - _BLADE_SHARE]
 
 
 def _told_by_headers(exposures: Sequence[Exposure], ct: Path | None) -> list[str]:

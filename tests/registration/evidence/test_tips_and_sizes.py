@@ -14,13 +14,14 @@ from femoreg_torch.case import Case, CaseObject, Model, Start
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, CArm, centred_camera, project_points, transform_points
 from femoreg_torch.registration.doubts.device import (
+    _is_borne_out,
     doubts_about_size,
     doubts_about_told_tips,
     doubts_about_units,
     notes_on_unseen_tips,
 )
 from femoreg_torch.registration.evidence.sizes import device_size
-from femoreg_torch.registration.evidence.tips import _near_the_tip, _parted, _stretched, tip_length
+from femoreg_torch.registration.evidence.tips import TipLength, _near_the_tip, _parted, _stretched, tip_length
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.scene import RigidObject, Scene
 from femoreg_torch.volume import Volume, axis_aligned
@@ -285,3 +286,19 @@ def test_an_end_is_drawn_out_by_so_much_and_all_else_stays(mm: int) -> None:
     z = range(end.data.shape[0])
     assert float(rest.data.sum() + end.data.sum()) == pytest.approx(float(whole.data.sum()), rel=1e-5)
     assert float(drawn_out.data[min(z)].sum()) == pytest.approx(float(end.data[min(z)].sum()), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("estimated", "as_told", "counts"),
+    [
+        (TipLength(2.31, 0.31, 0.063), TipLength(2.42, 0.31, 0.070), True),  # 2.5 mm longer than its model
+        (TipLength(1.96, 0.084, 0.270), TipLength(2.04, 0.113, 0.119), True),  # the same, its end estimated badly
+        (TipLength(0.89, 0.012, 0.350), TipLength(-0.05, 0.0, 0.149), False),  # right, its end estimated badly
+        (TipLength(-1.45, 0.060, 0.241), TipLength(0.65, 0.005, 0.197), False),  # right, on equalised images
+        (TipLength(1.2, 0.03, 0.1), TipLength(0.1, 0.0, 0.2), True),  # a model as told that fits badly knows nothing
+    ],
+)
+def test_an_estimated_end_counts_unless_the_model_as_told_fits_better_without(
+    estimated: TipLength, as_told: TipLength, counts: bool
+) -> None:
+    assert _is_borne_out(estimated, as_told) is counts

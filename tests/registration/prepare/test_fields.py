@@ -178,6 +178,29 @@ def test_a_shutter_that_one_image_hides_is_known_from_another(tmp_path: Path, mo
     assert read_images(case)[1]["anatomy"][1] is None  # its shutter was open
 
 
+def test_a_shutter_that_was_found_but_in_part_is_known_from_another_image(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beam = 30000 * torch.exp(-torch.rand(88, 88, generator=torch.Generator().manual_seed(0)) / 3)
+    whole = find_shutter(torch.where(FIELD, beam, 60.0), CARM.camera)
+    assert whole is not None
+    part = replace(whole, exposed=whole.exposed + 0.1, field=torch.ones(88, 88, dtype=torch.bool))
+    case = case_with(tmp_path, torch.where(FIELD, beam, 60.0))
+    write_image(tmp_path / "view2.tif", torch.where(FIELD, beam.flip(0), 60.0).to(torch.uint16))
+    case = replace(case, views=(*case.views, View({"anatomy": tmp_path / "view2.tif"})))
+
+    def second_field() -> Tensor:
+        found = iter([whole, part])
+        monkeypatch.setattr(reading_of_images, "find_shutter", lambda raw, camera: next(found))
+        field = read_images(case)[1]["anatomy"][1]
+        assert field is not None
+        return field
+
+    assert torch.equal(second_field(), whole.field)
+    write_image(tmp_path / "view2.tif", beam.flip(0).to(torch.uint16))  # which shows no edge where the other one does
+    assert torch.equal(second_field(), part.field)
+
+
 def test_a_field_is_found_or_told_by_the_case(tmp_path: Path) -> None:
     generator = torch.Generator().manual_seed(0)
     smooth = torch.nn.functional.interpolate(torch.rand(1, 1, 6, 6, generator=generator), (88, 88), mode="bicubic")
