@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool2d
 from femoreg_torch.case import Case
 from femoreg_torch.errors import in_mm
 from femoreg_torch.geometry import Poses, transform_points
-from femoreg_torch.registration.evidence.besides import besides, rival
+from femoreg_torch.registration.evidence.besides import besides, brighter_about, rival
 from femoreg_torch.registration.evidence.sizes import device_size
 from femoreg_torch.registration.evidence.tips import TipLength, tip_length
 from femoreg_torch.registration.imaging import Imaging
@@ -98,7 +98,7 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
             empty &= ~_within_others(thing.volume.data >= _CASTS_NO_SHADOW, width)
             where = empty.nonzero()
             points = transform_points(thing.volume.lps_from_index, where.flip(1).double().cpu())
-            bright = _where_no_shadow_is(scene.where_unsaturated())
+            bright = _where_no_shadow_is(scene.where_unsaturated(), poses, name)
             empty[where.unbind(1)] = in_view(bright, poses, name, points).to(empty.device)
             share = float(empty.sum() / inside.sum())
         if share > _MOST_WITHOUT_SHADOW:
@@ -109,9 +109,11 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
     return tuple(found)
 
 
-def _where_no_shadow_is(scene: Scene) -> Scene:
-    """The same with only those pixels exposed that have as much light as in the image without the device."""
+def _where_no_shadow_is(scene: Scene, poses: Poses, name: str) -> Scene:
+    """The same with only those pixels exposed that have as much light as in the image without the device.
 
+    Images that were equalised for display are brighter all about a dark device. Where they are, that is taken off.
+    """
     radius = int(_AVERAGED_MM / scene.carm.camera.mean_pixel_mm / 2)
 
     def left(kind: Kind, view: int) -> Tensor | None:
@@ -119,6 +121,7 @@ def _where_no_shadow_is(scene: Scene) -> Scene:
         if kind == first or not (scene.there([first], [view]) and scene.there([kind], [view])):
             return exposed
         shadow = scene.image(kind, view) - scene.image(first, view)
+        shadow = shadow - brighter_about(scene, poses, name, kind, view)
         bright = avg_pool2d(shadow[None], 2 * radius + 1, 1, radius, count_include_pad=False)[0] < _NO_SHADOW
         return bright if exposed is None else exposed & bright
 
@@ -245,8 +248,9 @@ def doubts_beside_devices(scene: Scene, poses: Poses, imaging: Imaging, in_doubt
                 "other images lack (cement, a hand, a clamp?): it may be what the other doubts come from"
             )
         if went and in_doubt:
+            equalised = ", or brighter all about it, as images are that were equalised for display" if went[1:] else ""
             told.append(
                 f"the images without the {name} of view {' and '.join(map(str, went))} show something that those with "
-                f"it lack (the {name} itself?): it may be what the other doubts come from"
+                f"it lack (the {name} itself{equalised}?): it may be what the other doubts come from"
             )
     return tuple(told)

@@ -34,6 +34,7 @@ _SHADOW = 0.15  # of the logarithm of intensity: what is seen of 0.15 mm of stee
 _LEAST_STEP = 0.5  # of that: by how much a shadow is stronger within its edge than beyond it
 _AROUND_MM = 6.0  # on the detector, beside what is drawn: of a pose or model that is a little wrong; and of an edge
 _LEAST_SHARE, _LEAST_MM2 = 0.2, 150.0  # of the device's own shadow, and on the detector
+_SMOOTH_MM, _MOST_BRIGHTER = 15.0, 1.0  # on the detector, standard deviation; of the logarithm of intensity
 _INSIDE = 0.2  # of the greatest attenuation: what counts as the device
 _MOST_POINTS = 5_000
 _NEAREST_MM, _FARTHEST_MM, _STEP_MM = 4.0, 24.0, 2.0  # along both axes across the device: where another is looked for
@@ -81,6 +82,24 @@ def besides(scene: Scene, poses: Poses, name: str, kind: Kind) -> list[Besides]:
     return [
         found for _, view in scene.there([kind], range(scene.views)) if (found := _look(scene, poses, name, kind, view))
     ]
+
+
+def brighter_about(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Tensor:
+    """How much brighter (H, W), 0 or negative, the image with a device is than the one without it about its shadow.
+
+    Of the logarithm of intensity, smoothed over some centimetres, and continued into the shadow.
+    """
+    image = scene.image(kind, view)
+    camera = poses.camera(view, _LEVEL.camera(scene.carm.camera))
+    without, with_it = (_LEVEL.image(scene.image(each, view), scene.carm.camera) for each in (scene.first_kind, kind))
+    drawn = draw([scene.objects[name]], poses.camera_from(name)[view][None, None], camera, _LEVEL.step_mm)[0] > 0
+    elsewhere = exposed_in_both(scene, (scene.first_kind, kind), view, _LEVEL) & ~dilated(drawn, _AROUND_MM, camera)
+    counts = elsewhere.cpu().double().numpy()
+    change = ((with_it - without).cpu().double().numpy() * counts).clip(-_MOST_BRIGHTER, _MOST_BRIGHTER)
+    width = _SMOOTH_MM / np.array(camera.pixel_mm)
+    summed, weight = (ndimage.gaussian_filter(each, width, mode="constant") for each in (change, counts))
+    smooth = torch.from_numpy((summed / weight.clip(1e-6)).clip(None, 0)).to(image)
+    return F.interpolate(smooth[None, None], tuple(image.shape), mode="bilinear")[0, 0]
 
 
 def _look(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Besides | None:
