@@ -46,6 +46,7 @@ from femoreg_torch.volume import (
     soft_bones,
     stray_landmarks,
     swapped_sides,
+    turned_labels,
 )
 from femoreg_torch.volume.bones import nearest_voxel
 
@@ -105,6 +106,8 @@ def check_bones(
         found.problem(f"{seen.unscaled}.")
     elif seen.light is not None:
         found.warnings.append(seen.light)
+    elif (turned := turned_labels(ct, bones.labels)) is not None:
+        found.warnings.append(turned)
     elif (misplaced := misplaced_labels(ct, bones.labels, list(bones.ids.values()))) is not None:
         found.warnings.append(misplaced)
     elif (elsewhere := seen.elsewhere or soft_bones(ct, bones.labels, bones.ids)) is not None:

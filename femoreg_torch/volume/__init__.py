@@ -2,7 +2,13 @@
 
 from femoreg_torch.volume.attenuation import hu_to_attenuation, structure_attenuation
 from femoreg_torch.volume.bones import BoneLabels, bone_labels
-from femoreg_torch.volume.contradictions import densities, misplaced_labels, shifted_labels, soft_bones
+from femoreg_torch.volume.contradictions import (
+    densities,
+    misplaced_labels,
+    shifted_labels,
+    soft_bones,
+    turned_labels,
+)
 from femoreg_torch.volume.device import label_share, labelled_device, scanned_device
 from femoreg_torch.volume.dicom.series import patient_of
 from femoreg_torch.volume.grid import Volume, axis_aligned, changes_in_place
@@ -86,6 +92,7 @@ __all__ = [
     "stray_landmarks",
     "structure_attenuation",
     "swapped_sides",
+    "turned_labels",
     "voxelise_mesh",
     "write_landmarks",
     "write_volume",

@@ -1,10 +1,21 @@
 """Grey values and label maps that do not belong to one another, of bones that are balls and shells in soft tissue."""
 
+import math
+
 import pytest
 import torch
 from scipy import ndimage
 
-from femoreg_torch.volume import Volume, axis_aligned, densities, misplaced_labels, shifted_labels, soft_bones
+from femoreg_torch.geometry import about_point, exp_so3, rigid
+from femoreg_torch.volume import (
+    Volume,
+    axis_aligned,
+    densities,
+    misplaced_labels,
+    shifted_labels,
+    soft_bones,
+    turned_labels,
+)
 from femoreg_torch.volume.contradictions import intercept_twice
 
 IDS = (1, 2)
@@ -42,6 +53,7 @@ def test_what_belongs_together_is_not_doubted(spacing: tuple[float, float, float
     assert unasked(bare, labels)
     assert misplaced_labels(bare, labels, IDS) is None
     assert shifted_labels(ct, labels) is shifted_labels(bare, labels) is None
+    assert turned_labels(ct, labels) is turned_labels(bare, labels) is None
 
 
 @pytest.mark.parametrize("axes", [(0, 1), (0, 2), (1, 2)], ids=str)
@@ -113,6 +125,24 @@ def test_too_large_or_too_small_is_not_aside(voxels: int) -> None:
     change = ndimage.grey_dilation if voxels > 0 else ndimage.grey_erosion
     other = change(labels.data.numpy(), size=2 * abs(voxels) + 1)
     assert shifted_labels(ct, labels.with_data(torch.from_numpy(other))) is None
+    assert turned_labels(ct, labels.with_data(torch.from_numpy(other))) is None
+
+
+@pytest.mark.parametrize(("axis", "words"), [(1, "front to back"), (2, "head to feet")])
+@pytest.mark.parametrize("degrees", [-7, 7])
+def test_a_label_map_that_is_turned_is_told(axis: int, words: str, degrees: float) -> None:
+    """About the third axis, beside which all balls lie, a turn moves two of them by 1 mm."""
+    ct, labels = ct_and_labels()
+    of_three_balls = ndimage.binary_fill_holes((ct.data > 400).numpy()).astype("uint8")
+    twist = torch.zeros(3, dtype=torch.float64)
+    twist[axis] = math.radians(degrees)
+    to_index = torch.linalg.inv(labels.lps_from_index)
+    index_from_index = to_index @ about_point(rigid(exp_so3(twist)), labels.centre()) @ labels.lps_from_index
+    turn, shift = index_from_index[:3, :3].flip(0, 1).numpy(), index_from_index[:3, 3].flip(0).numpy()
+    turned = ndimage.affine_transform(of_three_balls, turn, shift, order=0)
+    told = turned_labels(ct, labels.with_data(torch.from_numpy(turned)))
+    assert told is not None
+    assert words in told
 
 
 @pytest.mark.parametrize("shift", [(4, 0, 0), (0, -8, 0), (3, 3, -11)])

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.case import Case
-from femoreg_torch.volume import BoneLabels, Volume, shifted_labels
+from femoreg_torch.volume import BoneLabels, Volume, shifted_labels, turned_labels
 from femoreg_torch.volume.bones import nearest_voxel
 from femoreg_torch.volume.contradictions import bare_bone
 
@@ -42,9 +42,11 @@ def heads_near_landmarks(case: Case, bones: BoneLabels) -> dict[str, "Head"]:
 
 def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels, heads: Mapping[str, "Head"]) -> tuple[str, ...]:
     """All that CT, landmarks and plan say against the label map, which lies on the CT's grid, in words."""
-    shift = shifted_labels(ct, bones.labels)
     told = []
-    if shift is not None:
+    turned = turned_labels(ct, bones.labels)
+    if turned is not None:
+        told.append(turned)
+    elif (shift := shifted_labels(ct, bones.labels)) is not None:
         by = ", ".join(f"{mm + 0.0:.0f}" for mm in shift.tolist())
         told.append(
             f"the label map would lie on the bones of the CT if it were moved by ({by}) mm LPS: check that it belongs "
