@@ -49,6 +49,7 @@ from femoreg_torch.volume import (
     turned_labels,
 )
 from femoreg_torch.volume.bones import nearest_voxel
+from femoreg_torch.volume.lost_slices import told_of_lost_slice
 
 _MOST_NAMES = 8
 
@@ -112,6 +113,8 @@ def check_bones(
         found.warnings.append(misplaced)
     elif (elsewhere := seen.elsewhere or soft_bones(ct, bones.labels, bones.ids)) is not None:
         found.warnings.append(elsewhere)
+    lost = told_of_lost_slice(ct, bones.labels)
+    found.warnings += [] if lost is None else [lost]
     found.facts.append(f"bones: {', '.join(bones.ids)}")
     names = [name for name, ids in segment_names(path).items() if not wanted & set(ids)] if has_names(path) else []
     if names:

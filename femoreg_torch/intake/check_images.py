@@ -50,6 +50,8 @@ from femoreg_torch.volume import Patient
 
 # A detector of 200 to 430 mm, 900 to 1,300 mm from the source, is seen under 9 to 27°; one told in wrong units is not.
 _OPENING_DEG = 3.0, 45.0
+_MOST_OFF_MIDDLE = 0.25  # of the picture: a principal point that a picture of the whole detector has not
+_ISOCENTRE = 0.3, 1.0  # of the source distance; of the presets 0.53 and 0.62
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +91,7 @@ def check_views(
     if not views:
         found.problem(f"{top.where('views')}: empty. At least one fluoroscopic image is needed.")
     if carm is not None:
-        found.warnings += _told_of_beam(carm.camera)
+        found.warnings += _told_of_carm(carm)
     read: dict[str, _Seen] = {}
     poses: dict[str, Tensor] = {}
     for number, view in enumerate(views):
@@ -126,7 +128,7 @@ def check_views(
 
 def check_images(case: Case, patient: Patient, found: Found) -> dict[str, Tensor]:
     """All images of a case whose CT is of that patient. Returns those (H, W) that could be read themselves, by key."""
-    found.warnings += _told_of_beam(case.carm.camera)
+    found.warnings += _told_of_carm(case.carm)
     read: dict[str, _Seen] = {}
     for number, view in enumerate(case.views):
         shown = View({}, view.intensity, frames=view.frames, display=case.display_of(number))
@@ -186,16 +188,35 @@ def _check_image(
         found.attempt(lambda: check_header(stored.tags, camera, shown, carm.uncertainty, f"{where}: {path.name}"))
 
 
-def _told_of_beam(camera: Camera) -> list[str]:
-    """A beam that opens as no C-arm's does, in words."""
+def _told_of_carm(carm: CArm) -> list[str]:
+    """What is told of a C-arm as none has it, in words."""
+    camera, told = carm.camera, []
     wide_mm = max(extent * mm for extent, mm in zip(camera.shape, camera.pixel_mm, strict=True))
     opens = math.degrees(2 * math.atan2(wide_mm / 2, camera.sdd_mm))
-    if _OPENING_DEG[0] <= opens <= _OPENING_DEG[1]:
-        return []
-    return [
-        f"the C-arm's file tells {camera.sdd_mm:.4g} mm from the source to a detector {wide_mm:.3g} mm wide: a beam of "
-        f"{opens:.2g}°, where C-arms have some 10 to 25°. Are source distance and pixel size in mm?"
-    ]
+    if not _OPENING_DEG[0] <= opens <= _OPENING_DEG[1]:
+        told.append(
+            f"the C-arm's file tells {camera.sdd_mm:.4g} mm from the source to a detector {wide_mm:.3g} mm wide: a "
+            f"beam of {opens:.2g}°, where C-arms have some 10 to 25°. Are source distance and pixel size in mm?"
+        )
+    column, row = camera.principal_point_px
+    off = max(
+        abs(column - (camera.shape[1] - 1) / 2) / camera.shape[1],
+        abs(row - (camera.shape[0] - 1) / 2) / camera.shape[0],
+    )
+    if off > _MOST_OFF_MIDDLE:
+        told.append(
+            f"the C-arm's file tells a principal point at column {column:.5g} and row {row:.5g} of {camera.shape[1]} × "
+            f"{camera.shape[0]}, {off:.0%} of the picture off its middle: is `principal_point_px` in pixels, the "
+            "column first? It is right of a picture that is cropped to one side"
+        )
+    depth = carm.isocentre_mm[2]
+    if not _ISOCENTRE[0] * camera.sdd_mm <= depth <= _ISOCENTRE[1] * camera.sdd_mm:
+        told.append(
+            f"the C-arm's file tells an isocentre {depth:.4g} mm from the source, and a detector {camera.sdd_mm:.4g} "
+            "mm from it: it lies between the two, mostly at some 0.6 of the way. Is `isocentre_mm` in mm, and its last "
+            "number along the beam?"
+        )
+    return told
 
 
 def _check_field(field: Circle | Polygon | Path | None, camera: Camera, where: str) -> None:

@@ -38,7 +38,7 @@ from femoreg_torch.volume import (
 )
 from femoreg_torch.volume.borders import cut_bones
 from femoreg_torch.volume.dicom.headers import damaged_header, is_dicom
-from femoreg_torch.volume.dicom.series import series_in
+from femoreg_torch.volume.dicom.series import series_in, told_apart
 from femoreg_torch.volume.mesh_files import bounds_of
 from femoreg_torch.volume.segments import SEGMENTATION_SUFFIX
 
@@ -110,7 +110,7 @@ def _folder(path: Path, series: str | None) -> Findings:
         return _listed(path, "several things")
     if not there:
         raise InputError(f"{path}: holds no case.yaml, no DICOM files, no images and no masks of bones.")
-    facts = [one.told for one in there]
+    facts = told_apart(there) if there[1:] else [one.told for one in there]
     volumes = [one for one in there if one.may_be_volume]
     if series is None and len(volumes) != 1:
         if len(there) == 1 and there[0].modality == "SEG":

@@ -105,7 +105,10 @@ def _check_given(given: NewCase) -> None:
         f"--{name} is missing{offer.get(name, '')}" for name in NEEDED if name not in found and not getattr(given, name)
     ]
     paths = {name: getattr(given, name) for name in ("ct", "labels", "landmarks", "plan", "device", "device_points")}
-    for name, path in {**paths, "device_transform": given.device_transform}.items():
+    paths["device_transform"] = given.device_transform
+    if given.carm is not None and Path(given.carm).suffix in (".yaml", ".yml"):  # else the name of a preset, or `dicom`
+        paths["carm"] = Path(given.carm)
+    for name, path in paths.items():
         if path is not None and (why := why_unreadable(Path(path), expected="file or folder")) is not None:
             told.append(f"--{name.replace('_', '-')}: {path}: {why}")
     for flag, images in (("images", given.images), ("device-images", given.device_images)):

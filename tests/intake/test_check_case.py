@@ -627,6 +627,30 @@ def test_a_beam_as_no_carm_has_it_is_a_warning(files: Path, tmp_path: Path) -> N
         assert any("Are source distance and pixel size in mm?" in warning for warning in warnings) == told
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, None),
+        ({"principal_point_px": [19.5, 23.5], "isocentre_mm": [0, 0, 620]}, None),
+        ({"principal_point_px": [78, 94]}, "principal point at column 78 and row 94 of 40 × 48"),
+        ({"isocentre_mm": [0, 0, 6200]}, "isocentre 6200 mm from the source"),
+        ({"isocentre_mm": [0, 0, 0.62]}, "isocentre 0.62 mm from the source"),
+        ({"isocentre_mm": [620, 0, 0]}, "isocentre 0 mm from the source"),
+    ],
+)
+def test_a_principal_point_or_an_isocentre_as_no_carm_has_it_is_a_warning(
+    change: dict[str, object], words: str | None, files: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "case"
+    shutil.copytree(files, folder)
+    content = case_content()
+    content["carm"] = {"sdd_mm": 1000, "pixel_mm": [4, 4], "shape": [48, 40]} | change
+    write_content(folder, content)
+    warnings = check_case(folder, find_start=False).warnings
+    told = [one for one in warnings if "principal point" in one or "isocentre" in one]
+    assert told == [] if words is None else (len(told) == 1 and words in told[0]), told
+
+
 def test_two_views_of_one_pose_are_told(files: Path, tmp_path: Path) -> None:
     folder = tmp_path / "case"
     shutil.copytree(files, folder)

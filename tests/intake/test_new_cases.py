@@ -212,6 +212,7 @@ def test_images_whose_values_stand_beside_their_headers_are_copied_whole(files: 
             {"labels": "none.nii.gz", "material": "steel", "hu": 3},
             ["none.nii.gz: no such file or folder", "--material and --hu"],
         ),
+        ({"carm": "none.yaml", "plan": None}, ["--plan is missing", "none.yaml: no such file"]),
         ({"labels": "labels.nii.gz"}, ["--bones: is missing", "hip bones and femora of femoreg"]),
         ({"images": ["plain/run1"]}, ["3 files, but there are 1 images without the device"]),
         ({"images": ["view1.png", "view2.png", "view3.png"]}, ["--carm: is missing, and view1.png is no DICOM file"]),

@@ -25,6 +25,7 @@ from pydicom.uid import (
 from scipy.spatial.transform import Rotation
 
 from femoreg_torch.errors import InputError
+from femoreg_torch.intake import inspect_path
 from femoreg_torch.volume import (
     Volume,
     read_ct,
@@ -253,6 +254,9 @@ def test_series_that_numbers_and_names_do_not_tell_apart_are_listed_with_what_do
         read_ct(folder)
     assert first.uid in str(told.value)
     assert second.uid in str(told.value)
+    inspected = " ".join(inspect_path(folder).facts)
+    assert first.uid in inspected
+    assert second.uid in inspected
     assert read_ct_told(folder, second.uid)[0].data.shape == SIZE
 
 

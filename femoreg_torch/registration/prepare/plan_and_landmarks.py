@@ -16,6 +16,7 @@ from femoreg_torch.case import Case
 from femoreg_torch.volume import BoneLabels, Volume, shifted_labels, turned_labels
 from femoreg_torch.volume.bones import nearest_voxel
 from femoreg_torch.volume.contradictions import bare_bone
+from femoreg_torch.volume.lost_slices import told_of_lost_slice
 
 if TYPE_CHECKING:  # with trimesh, whose import the reading of CT and images hides
     from femoreg_torch.segment import Head
@@ -52,6 +53,8 @@ def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels, heads: Map
             f"the label map would lie on the bones of the CT if it were moved by ({by}) mm LPS: check that it belongs "
             "to this CT, and the origin of both"
         )
+    lost = told_of_lost_slice(ct, bones.labels)
+    told += [] if lost is None else [lost]
     told += doubts_about_bare_bone(case, ct, bones)
     return (*told, *doubts_about_the_frame(case, bones, heads), *doubts_about_the_ends(case, bones))
 

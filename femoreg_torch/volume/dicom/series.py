@@ -109,10 +109,14 @@ def patient_of(path: Path, wanted: str | None = None) -> Patient:
     return patient_in(choose_series(path, wanted).slices[0].header)
 
 
-def _listed(series: Sequence[Series]) -> str:
-    """The series in a few words each; with the UIDs of those that nothing else tells apart."""
+def told_apart(series: Sequence[Series]) -> list[str]:
+    """Several series in a few words each; with the UIDs of those that nothing else tells apart."""
     names = [(one.number, one.description) for one in series]
     alone = [any(name) and names.count(name) == 1 for name in names]
-    told = [one.told if known else f"{one.told} {one.uid}" for one, known in zip(series, alone, strict=True)]
+    return [one.told if known else f"{one.told} {one.uid}" for one, known in zip(series, alone, strict=True)]
+
+
+def _listed(series: Sequence[Series]) -> str:
+    told = told_apart(series)
     more = f" and {len(told) - MOST_LISTED} more" if len(told) > MOST_LISTED else ""
     return ", ".join(told[:MOST_LISTED]) + more
