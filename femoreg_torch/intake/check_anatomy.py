@@ -113,7 +113,7 @@ def check_bones(
         found.warnings.append(misplaced)
     elif (elsewhere := seen.elsewhere or soft_bones(ct, bones.labels, bones.ids)) is not None:
         found.warnings.append(elsewhere)
-    lost = told_of_lost_slice(ct, bones.labels)
+    lost = told_of_lost_slice(ct, bones.labels, list(bones.ids.values()))
     found.warnings += [] if lost is None else [lost]
     found.facts.append(f"bones: {', '.join(bones.ids)}")
     names = [name for name, ids in segment_names(path).items() if not wanted & set(ids)] if has_names(path) else []

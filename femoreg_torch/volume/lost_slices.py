@@ -5,6 +5,7 @@ at once. So the change across each gap is compared with the mean of the changes 
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from torch.nn import functional as F
 from femoreg_torch.volume.grid import Volume
 from femoreg_torch.volume.labels import label_box
 
-_HU = -200.0, 1000.0  # what moves on: bone and skin, and not metal or air
+_HU = -200, 1000  # what moves on: bone and skin, and not metal or air
 _PIXEL_MM, _SMOOTH_PX = 2.0, 3  # grey values are averaged over so many of such pixels, along both axes
 _BLOCK_MM = 24.0  # what is looked at by itself
 _BESIDE_MM = 40.0  # of the bones
@@ -25,14 +26,11 @@ _LEAST_STEADY = 0.4  # of the changes beside those before and behind, in the med
 _LEAST_MORE, _LEAST_FACTOR = 0.75, 1.5
 
 
-def lost_slice(ct: Volume, labels: Volume) -> int | None:
+def lost_slice(ct: Volume, labels: Volume, ids: Sequence[int]) -> int | None:
     """The slice (from 0) of a CT, HU, after which the anatomy goes on as if one or more were missing, or None.
 
-    Looked for along the slices that hold bones of a label map on the grid of the CT, and 40 mm about them.
+    Looked for in the box of the bones of these ids, of a label map on the grid of the CT, and 40 mm about it.
     """
-    ids = [int(one) for one in labels.data.unique() if one]
-    if not ids:
-        return None
     low, high = label_box(labels, ids)
     margin = [math.ceil(_BESIDE_MM / s) for s in ct.spacing_mm]
     x, y, z = (
@@ -40,7 +38,7 @@ def lost_slice(ct: Volume, labels: Volume) -> int | None:
         for a, b, m, n in zip(low, high, margin, reversed(ct.data.shape), strict=True)
     )
     across, down = (max(1, round(_PIXEL_MM / s)) for s in ct.spacing_mm[:2])
-    near = ct.data[z, y, x].float().clamp(*_HU)
+    near = ct.data[z, y, x].clamp(*_HU).float()
     thick = F.avg_pool2d(F.avg_pool2d(near[:, None], (down, across)), _SMOOTH_PX, 1)[:, 0]
     if len(thick) < 5:
         return None
@@ -72,9 +70,9 @@ def _steadiness(thick: Tensor, side: list[int]) -> tuple[Tensor, Tensor]:
     return ratio.nanquantile(_SHARE, 1), counts.sum(1)
 
 
-def told_of_lost_slice(ct: Volume, labels: Volume) -> str | None:
+def told_of_lost_slice(ct: Volume, labels: Volume, ids: Sequence[int]) -> str | None:
     """What `lost_slice` finds, in words."""
-    found = lost_slice(ct, labels)
+    found = lost_slice(ct, labels, ids)
     if found is None:
         return None
     height = float(ct.lps_from_index[2, 2] * found + ct.lps_from_index[2, 3])

@@ -53,7 +53,7 @@ def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels, heads: Map
             f"the label map would lie on the bones of the CT if it were moved by ({by}) mm LPS: check that it belongs "
             "to this CT, and the origin of both"
         )
-    lost = told_of_lost_slice(ct, bones.labels)
+    lost = told_of_lost_slice(ct, bones.labels, list(bones.ids.values()))
     told += [] if lost is None else [lost]
     told += doubts_about_bare_bone(case, ct, bones)
     return (*told, *doubts_about_the_frame(case, bones, heads), *doubts_about_the_ends(case, bones))
