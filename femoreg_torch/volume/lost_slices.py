@@ -18,6 +18,7 @@ _HU = -200, 1000  # what moves on: bone and skin, and not metal or air
 _PIXEL_MM, _SMOOTH_PX = 2.0, 3  # grey values are averaged over so many of such pixels, along both axes
 _BLOCK_MM = 24.0  # what is looked at by itself
 _BESIDE_MM = 40.0  # of the bones
+_LEAST_SLICES = 6  # for three gaps that have one on either side
 _LEAST_CHANGE_HU = 15.0  # of a block, for it to count; noise of thick pixels is less
 _LEAST_BLOCKS = 16  # that count at a gap and at its neighbours
 _SHARE = 0.25  # of the blocks that may tell less: bones end somewhere at once, but not everywhere
@@ -39,10 +40,11 @@ def lost_slice(ct: Volume, labels: Volume, ids: Sequence[int]) -> int | None:
     )
     across, down = (max(1, round(_PIXEL_MM / s)) for s in ct.spacing_mm[:2])
     near = ct.data[z, y, x].clamp(*_HU).float()
-    thick = F.avg_pool2d(F.avg_pool2d(near[:, None], (down, across)), _SMOOTH_PX, 1)[:, 0]
-    if len(thick) < 5:
-        return None
     side = [max(1, round(_BLOCK_MM / (s * n))) for s, n in zip(ct.spacing_mm[1::-1], (down, across), strict=True)]
+    left = [n // by - _SMOOTH_PX + 1 for n, by in zip(near.shape[1:], (down, across), strict=True)]
+    if len(near) < _LEAST_SLICES or any(n < block for n, block in zip(left, side, strict=True)):
+        return None
+    thick = F.avg_pool2d(F.avg_pool2d(near[:, None], (down, across)), _SMOOTH_PX, 1)[:, 0]
     found, count = _steadiness(thick, side)
     known = found[count >= _LEAST_BLOCKS]
     if not len(known) or float(known.median()) < _LEAST_STEADY:

@@ -40,3 +40,13 @@ def test_a_slice_that_is_missing_is_told(missing: list[int]) -> None:
 
 def test_every_other_slice_is_a_ct_of_thick_slices() -> None:
     assert lost_slice(*ct_and_labels(list(range(0, SLICES, 2))), IDS) is None
+
+
+@pytest.mark.parametrize("shape", [(60, 1, 1), (1, 220, 320), (5, 60, 60), (6, 40, 40), (60, 40, 2), (7, 8, 14)])
+def test_of_a_small_ct_nothing_is_asked(shape: tuple[int, int, int]) -> None:
+    ct, labels = ct_and_labels(list(range(SLICES)))
+    part = (slice(shape[0]), slice(70, 70 + shape[1]), slice(50, 50 + shape[2]))
+    for spacing in (0.05, 1.0, 3.0):
+        affine = axis_aligned((spacing,) * 3, (0.0, 0.0, 0.0))
+        bone = torch.ones_like(labels.data[part])
+        assert lost_slice(Volume(ct.data[part], affine), Volume(bone, affine), (1,)) is None
