@@ -216,7 +216,8 @@ def _bodies(scene: "trimesh.Scene", path: Path) -> "dict[str, trimesh.Trimesh]":
     bodies = {}
     for node in sorted(scene.graph.nodes_geometry):
         place, geometry = scene.graph[node]
-        name = str(geometry if node.startswith("=>[") else node)  # a place in a STEP assembly that has no name
+        unnamed = node.startswith("=>[") and geometry not in scene.graph.nodes_geometry  # a place in a STEP assembly
+        name = str(geometry) if unnamed and geometry not in bodies else node
         surface = scene.geometry[geometry]
         if not isinstance(surface, trimesh.Trimesh):
             raise InputError(f"{path}: triangle meshes were expected, found {type(surface).__name__}.")

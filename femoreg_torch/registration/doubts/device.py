@@ -188,10 +188,10 @@ def _tip_elsewhere(
     guide = points["base"], model_end(points)
     as_told = replace(scene, objects=scene.objects | {name: told.objects[name]})
     found, if_told = (tip_length(of, poses, name, kind, guide, imaging) for of in (scene, as_told))
-    if found is None or if_told is None:
-        return None
-    off = [found] if _ends_elsewhere(found) and _is_borne_out(found, if_told) else []
-    if if_told.longer_mm < 0 and _ends_elsewhere(if_told):
+    off = []
+    if found is not None and _ends_elsewhere(found) and (if_told is None or _is_borne_out(found, if_told)):
+        off.append(found)
+    if if_told is not None and if_told.longer_mm < 0 and _ends_elsewhere(if_told):
         off.append(if_told)
     return max(off, key=lambda each: each.gain, default=None)
 

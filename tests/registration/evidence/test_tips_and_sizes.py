@@ -174,10 +174,14 @@ def test_soft_tissue_lies_about_the_bones_while_a_tip_is_asked(
     torch.testing.assert_close(torch.stack(drawn_at), TRUTH.camera_from("pelvis"))
 
 
-def test_a_tip_that_was_estimated_to_be_empty_is_asked_as_it_was_told(scene: Scene) -> None:
+@pytest.mark.parametrize("left_mm", [60, 34])
+def test_a_tip_that_was_estimated_to_be_empty_is_asked_as_it_was_told(scene: Scene, left_mm: float) -> None:
+    """Where nothing at all is left near the tip, too."""
     tip = TIP + float64(0, 0, 3)
+    estimated = with_model(scene, tool(left_mm))
+    assert (tip_length(estimated, TRUTH, "device", "device", (BASE, tip), PLAIN) is None) == (left_mm < 60)
     case = replace(CASE, objects={"device": CaseObject("device", points={"base": BASE, "tip": tip})})
-    (doubt,) = doubts_about_size(case, with_model(scene, tool(63)), scene, TRUTH, PLAIN)
+    (doubt,) = doubts_about_size(case, with_model(scene, tool(63)), estimated, TRUTH, PLAIN)
     assert "before the tip of its model" in doubt
 
 
