@@ -1,7 +1,7 @@
 """The projector's small images, with fine voxels and with voxels that fit the image, by two versions by turns.
 
     git worktree add ../before COMMIT
-    python benchmarks/small_images.py before=../before now=. [--case FOLDER] [--turns 5] [--seconds 1]
+    python benchmarks/small_images.py 2b18154=../before now=. [--case FOLDER] [--turns 5] [--seconds 1]
 
 The coarse levels of a registration draw 96 × 96 and 192 × 192 pixels of 3.1 and 1.6 mm. Voxels of 4 and 2 mm, with
 steps as long, fit them. Writes a section of benchmarks/RESULTS.md.
@@ -14,20 +14,21 @@ import os
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 
 _SIDES_AND_MERGED = ((96, 1), (96, 4), (192, 1), (192, 2), (384, 1))  # pixels along a side, and voxels made one
 _COUNTS = (1, 16)
-_TASKS = ("forward", "gradient", "jacobian")
 
 
 def measure_tree(scene: Path, seconds: float) -> dict[str, float]:
     """Milliseconds per pose of each kind of call, by the version that this process imports."""
     import torch
     from measure import measure
+    from torch import Tensor
 
     from femoreg_torch.drr import project, project_with_jacobian
-    from femoreg_torch.geometry import load_carm
+    from femoreg_torch.geometry import Camera, load_carm
     from femoreg_torch.volume.grid import Volume
 
     stored = torch.load(scene, weights_only=True)
@@ -42,24 +43,24 @@ def measure_tree(scene: Path, seconds: float) -> dict[str, float]:
         lps_from_index[:3, :3] *= count
         return Volume(data, lps_from_index)
 
+    def forward(volume: Volume, poses: Tensor, camera: Camera, step_mm: float) -> None:
+        with torch.no_grad():
+            project(volume, poses, camera, step_mm)
+
+    def gradient(volume: Volume, poses: Tensor, camera: Camera, step_mm: float) -> None:
+        project(volume, poses.clone().requires_grad_(), camera, step_mm).sum().backward()
+
+    def jacobian(volume: Volume, poses: Tensor, camera: Camera, step_mm: float) -> None:
+        project_with_jacobian(volume, poses, camera, centre, step_mm)
+
     found = {}
     for side, count in _SIDES_AND_MERGED:
         volume, camera = merged(count), load_carm("cios_fusion").camera.downsampled(1536 // side)
         for many in _COUNTS:
             poses = stored["poses"][:many]
-
-            def forward(volume=volume, camera=camera, poses=poses, step=float(count)) -> None:  # type: ignore[no-untyped-def]
-                with torch.no_grad():
-                    project(volume, poses, camera, step)
-
-            def gradient(volume=volume, camera=camera, poses=poses, step=float(count)) -> None:  # type: ignore[no-untyped-def]
-                project(volume, poses.clone().requires_grad_(), camera, step).sum().backward()
-
-            def jacobian(volume=volume, camera=camera, poses=poses, step=float(count)) -> None:  # type: ignore[no-untyped-def]
-                project_with_jacobian(volume, poses, camera, centre, step)
-
-            for task, call in zip(_TASKS, (forward, gradient, jacobian), strict=True):
-                found[f"{side} {count} {many} {task}"] = 1e3 * measure(call, "cpu", seconds).median / many
+            for task in (forward, gradient, jacobian):
+                timing = measure(partial(task, volume, poses, camera, float(count)), "cpu", seconds)
+                found[f"{side} {count} {many} {task.__name__}"] = 1e3 * timing.median / many
     return found
 
 

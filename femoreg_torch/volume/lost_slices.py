@@ -23,7 +23,9 @@ _LEAST_CHANGE_HU = 15.0  # of a block, for it to count; noise of thick pixels is
 _LEAST_BLOCKS = 16  # that count at a gap and at its neighbours
 _SHARE = 0.25  # of the blocks that may tell less: bones end somewhere at once, but not everywhere
 _LEAST_STEADY = 0.4  # of the changes beside those before and behind, in the median of gaps: else noise hides them
-# Of the change across a gap: how much more than at its neighbours, and than in the median by which factor.
+# Of the change across a gap: how much more than at its neighbours, and than in the median by which factor. Of 71 right
+# CTs of six makes at most 0.60 and 1.6, or 0.77 and 1.06. Of 11 that lacked one to four slices, seven: 0.86 and 1.8 to
+# 2.4 and 3.8. One that lacked a slice of 1.25 mm: 0.62 and 1.5.
 _LEAST_MORE, _LEAST_FACTOR = 0.75, 1.5
 
 
@@ -77,8 +79,7 @@ def told_of_lost_slice(ct: Volume, labels: Volume, ids: Sequence[int]) -> str | 
     found = lost_slice(ct, labels, ids)
     if found is None:
         return None
-    height = float(ct.lps_from_index[2, 2] * found + ct.lps_from_index[2, 3])
     return (
-        f"CT: from slice {found} to {found + 1} (counted from 0, at {height:.0f} mm) bones and skin go on as if a "
-        "slice were missing between them, or as if the patient had moved there: export the CT anew and count its slices"
+        f"CT: from slice {found} to {found + 1} of {len(ct.data)} (counted from 0) bones and skin go on as if a slice "
+        "were missing between them, or as if the patient had moved there: export the CT anew and count its slices"
     )

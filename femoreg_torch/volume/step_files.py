@@ -11,7 +11,7 @@ from femoreg_torch.extras import extra_of
 
 STEP_SUFFIXES = (".step", ".stp")
 _TOLERANCE_MM, _TOLERANCE_RAD = 0.01, 0.1  # of triangles from a curved surface: far below what an image can tell
-_LONGEST_S = 120.0  # an assembly of 300 solids takes some seconds
+_LONGEST_S = 120.0  # a sleeve with a handle takes a second
 _CONVERT = (  # runs by itself: OpenCASCADE ends the whole process on many a damaged file
     "import sys; from pathlib import Path; import cascadio; "
     "found = cascadio.load(Path(sys.argv[1]).read_bytes(), 'step', "

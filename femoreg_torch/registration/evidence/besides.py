@@ -84,19 +84,33 @@ def besides(scene: Scene, poses: Poses, name: str, kind: Kind) -> list[Besides]:
     ]
 
 
+@dataclass(frozen=True)
+class _Change:
+    """How an image with a device differs from that without it, on pixels of `_LEVEL`."""
+
+    camera: Camera
+    change: Tensor  # (H, W), of the logarithm of intensity: darker with the device than without it
+    own: Tensor  # (H, W), bool: exposed pixels that the device is drawn on
+    elsewhere: Tensor  # (H, W), bool: exposed pixels that it is not near
+
+
+def _change(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> _Change:
+    camera = poses.camera(view, _LEVEL.camera(scene.carm.camera))
+    without, with_it = (_LEVEL.image(scene.image(each, view), scene.carm.camera) for each in (scene.first_kind, kind))
+    exposed = exposed_in_both(scene, (scene.first_kind, kind), view, _LEVEL)
+    drawn = draw([scene.objects[name]], poses.camera_from(name)[view][None, None], camera, _LEVEL.step_mm)[0] > 0
+    return _Change(camera, with_it - without, drawn & exposed, exposed & ~dilated(drawn, _AROUND_MM, camera))
+
+
 def brighter_about(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Tensor:
     """How much brighter (H, W), 0 or negative, the image with a device is than the one without it about its shadow.
 
     Of the logarithm of intensity, smoothed over some centimetres, and continued into the shadow.
     """
-    image = scene.image(kind, view)
-    camera = poses.camera(view, _LEVEL.camera(scene.carm.camera))
-    without, with_it = (_LEVEL.image(scene.image(each, view), scene.carm.camera) for each in (scene.first_kind, kind))
-    drawn = draw([scene.objects[name]], poses.camera_from(name)[view][None, None], camera, _LEVEL.step_mm)[0] > 0
-    elsewhere = exposed_in_both(scene, (scene.first_kind, kind), view, _LEVEL) & ~dilated(drawn, _AROUND_MM, camera)
-    counts = elsewhere.cpu().double().numpy()
-    change = ((with_it - without).cpu().double().numpy() * counts).clip(-_MOST_BRIGHTER, _MOST_BRIGHTER)
-    width = _SMOOTH_MM / np.array(camera.pixel_mm)
+    image, seen = scene.image(kind, view), _change(scene, poses, name, kind, view)
+    counts = seen.elsewhere.cpu().double().numpy()
+    change = (seen.change.cpu().double().numpy() * counts).clip(-_MOST_BRIGHTER, _MOST_BRIGHTER)
+    width = _SMOOTH_MM / np.array(seen.camera.pixel_mm)
     summed, weight = (ndimage.gaussian_filter(each, width, mode="constant") for each in (change, counts))
     smooth = torch.from_numpy((summed / weight.clip(1e-6)).clip(None, 0)).to(image)
     return F.interpolate(smooth[None, None], tuple(image.shape), mode="bilinear")[0, 0]
@@ -105,21 +119,15 @@ def brighter_about(scene: Scene, poses: Poses, name: str, kind: Kind, view: int)
 def _look(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Besides | None:
     if not scene.there([scene.first_kind], (view,)):
         return None
-    images = [scene.image(each, view) for each in (scene.first_kind, kind)]
-    if not all(map(natural, images)):
+    if not all(natural(scene.image(each, view)) for each in (scene.first_kind, kind)):
         return None
-    camera = poses.camera(view, _LEVEL.camera(scene.carm.camera))
-    without, with_it = (_LEVEL.image(image, scene.carm.camera) for image in images)
-    exposed = exposed_in_both(scene, (scene.first_kind, kind), view, _LEVEL)
-    drawn = draw([scene.objects[name]], poses.camera_from(name)[view][None, None], camera, _LEVEL.step_mm)[0] > 0
-    around = dilated(drawn, _AROUND_MM, camera)
-    elsewhere = exposed & ~around
-    if not elsewhere.any():
+    seen = _change(scene, poses, name, kind, view)
+    if not seen.elsewhere.any():
         return None
-    change = with_it - without
-    change = change - change[elsewhere].median()  # exposures differ
-    mm2 = math.prod(camera.pixel_mm)
-    areas = (drawn & exposed & (change > _SHADOW), *(_shadows(way, elsewhere, camera) for way in (change, -change)))
+    change = seen.change - seen.change[seen.elsewhere].median()  # exposures differ
+    mm2 = math.prod(seen.camera.pixel_mm)
+    beside = (_shadows(way, seen.elsewhere, seen.camera) for way in (change, -change))
+    areas = (seen.own & (change > _SHADOW), *beside)
     return Besides(view, *(mm2 * int(area.count_nonzero()) for area in areas))
 
 
