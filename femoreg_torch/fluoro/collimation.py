@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from femoreg_torch.fluoro.intensity import downsample
-from femoreg_torch.geometry import Camera, circle_through
+from femoreg_torch.fluoro.shutter_sides import Array, Grid, Line, Mask, Ring, best_side
+from femoreg_torch.geometry import Camera
 
 MARGIN_MM = 2.5  # on the detector, from the edge: the penumbra of a focal spot of 0.6 mm
 _PIXEL_MM = 1.0  # that edges are looked for on
@@ -28,9 +28,7 @@ _LEAST_WHOLE = 0.7  # of what is no shadow: one piece; dense bone may cut off ot
 _MOST_SIDES = 8  # of an iris
 _BLADES = 4  # of a collimator without one
 _MOST_POINTS = 800  # of an edge
-_TRIES = 150  # random circles or lines
 _TOLERANCE_MM = 1.0  # of edge points from a circle or line
-_ROUNDER = 3  # times as many edge points lie on a circle as on a line; on that across the sides of an octagon, 1.3
 _LEAST_SHARE = 0.06  # of the edge points: what fewer lie on is no side
 _LEAST_DARK = 0.97  # of what lies beyond a side; the rest may be letters
 _NEAR_MM, _FAR_MM = 3.0, 6.0  # from the edge: where grey values on both sides of it are taken
@@ -44,9 +42,6 @@ _LEAST_BLADE = 0.4  # length of a blade in the image, of half the detector's sid
 _BLADE_STEP_MM = 2.0  # between places where a blade may be
 _MOST_BEYOND = 0.6  # of the grey value anywhere beyond a blade to that inside
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
 
 @dataclass(frozen=True)
 class Shutter:
@@ -55,7 +50,7 @@ class Shutter:
     shape: str  # in words
     exposed: float  # share of the detector
     field: Tensor  # (H, W) bool: the pixels inside, without the penumbra
-    sides: tuple["_Circle | _Line", ...]  # of its edge, in mm on the detector
+    sides: tuple[Ring | Line, ...]  # of its edge, in mm on the detector
 
 
 def exposed_field(raw: Tensor, camera: Camera) -> Tensor | None:
@@ -112,111 +107,23 @@ def shades(shutter: Shutter, raw: Tensor, camera: Camera) -> bool:
     return total > 0 and sharp >= _LEAST_SHARP * total
 
 
-def _coarse(raw: Tensor, camera: Camera) -> "tuple[Array, _Grid]":
+def _coarse(raw: Tensor, camera: Camera) -> "tuple[Array, Grid]":
     """A raw image on the pixels that edges are looked for on."""
     factor = max(1, round(_PIXEL_MM / camera.mean_pixel_mm))
     image = cv2.medianBlur(downsample(raw, factor).clamp_min(0).numpy(), 3).astype(np.float64)
-    return image, _Grid(image.shape, (camera.pixel_mm[1] * factor, camera.pixel_mm[0] * factor))
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """Coarse pixels: places (N, 2) along columns and rows, in mm from the middle of the first pixel."""
-
-    shape: tuple[int, ...]
-    pixel_mm: tuple[float, float]  # along columns, rows
-
-    @property
-    def edge_mm(self) -> float:
-        """The longer side of a pixel."""
-        return max(self.pixel_mm)
-
-    @property
-    def places(self) -> Array:
-        rows, columns = np.indices(self.shape)
-        return self.at(np.stack([columns, rows], -1).reshape(-1, 2))
-
-    @property
-    def middle(self) -> Array:
-        """The middle of the detector."""
-        return np.asarray((np.array(self.shape[::-1]) - 1) * self.pixel_mm / 2)
-
-    def at(self, pixels: NDArray[np.int64]) -> Array:
-        """Places of pixels (N, 2), column and row."""
-        return np.asarray(pixels * np.array(self.pixel_mm))
-
-    def within(self, places: Array) -> Mask:
-        """Which places lie on the detector."""
-        last = np.array(self.shape[::-1]) - 1
-        pixels = places / self.pixel_mm
-        return np.asarray(((pixels >= 0) & (pixels <= last)).all(-1))
-
-    def values(self, image: Array, places: Array) -> Array:
-        """An image at places (..., 2), interpolated; nan off the detector."""
-        last = np.array(self.shape[::-1]) - 1
-        pixels = (places / self.pixel_mm).clip(0, last)
-        low = np.minimum(pixels.astype(np.int64), last - 1)
-        (x, y), (right, down) = np.moveaxis(low, -1, 0), np.moveaxis(pixels - low, -1, 0)
-        above = image[y, x] * (1 - right) + image[y, x + 1] * right
-        below = image[y + 1, x] * (1 - right) + image[y + 1, x + 1] * right
-        return np.where(self.within(places), above * (1 - down) + below * down, np.nan)
-
-
-@dataclass(frozen=True)
-class _Circle:
-    middle: Array
-    radius: float
-
-    def depth(self, places: Array) -> Array:
-        """How far inside places (..., 2) lie, mm."""
-        return np.asarray(self.radius - np.linalg.norm(places - self.middle, axis=-1))
-
-    def outwards(self, places: Array) -> Array:
-        apart = places - self.middle
-        return np.asarray(apart / np.linalg.norm(apart, axis=-1, keepdims=True).clip(1e-9))
-
-    def edge(self, step_mm: float, grid: _Grid) -> Array:
-        """Places along it."""
-        angles = np.linspace(0, 2 * np.pi, max(8, round(2 * np.pi * self.radius / step_mm)), endpoint=False)
-        return np.asarray(self.middle + self.radius * np.stack([np.cos(angles), np.sin(angles)], -1))
-
-    def refitted(self, places: Array) -> "_Circle":
-        return _circle_of(places)
-
-
-@dataclass(frozen=True)
-class _Line:
-    normal: Array  # (2,) unit vector, outwards
-    offset: float  # of the line along it
-
-    def depth(self, places: Array) -> Array:
-        return np.asarray(self.offset - places @ self.normal)
-
-    def outwards(self, places: Array) -> Array:
-        return np.broadcast_to(self.normal, places.shape)
-
-    def edge(self, step_mm: float, grid: _Grid) -> Array:
-        along = np.array([-self.normal[1], self.normal[0]])
-        middle = grid.middle
-        reach = float(np.linalg.norm(middle))
-        foot = middle + self.depth(middle) * self.normal
-        return np.asarray(foot + np.arange(-reach, reach, step_mm)[:, None] * along)
-
-    def refitted(self, places: Array) -> "_Line":
-        line = _line_of(places)
-        return line if line.normal @ self.normal > 0 else _Line(-line.normal, -line.offset)
+    return image, Grid(image.shape, (camera.pixel_mm[1] * factor, camera.pixel_mm[0] * factor))
 
 
 @dataclass(frozen=True)
 class _Fit:
     """Sides that bound the field, and the share of its edge that is sharp."""
 
-    sides: list[_Circle | _Line] = field(default_factory=list)
+    sides: list[Ring | Line] = field(default_factory=list)
     sharp: float = 0.0
 
     @property
     def name(self) -> str:
-        round_, straight = (any(isinstance(side, kind) for side in self.sides) for kind in (_Circle, _Line))
+        round_, straight = (any(isinstance(side, kind) for side in self.sides) for kind in (Ring, Line))
         if round_:
             return "round and straight" if straight else "round"
         return "rectangular" if len(self.sides) <= _BLADES else "polygonal"
@@ -234,7 +141,7 @@ def _levels(image: Array) -> Iterator[float]:
         yield from np.geomspace(lowest, 0.3 * bright, _LEVELS).tolist()
 
 
-def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
+def _fit(image: Array, level: float, grid: Grid) -> _Fit | None:
     """The field of a shutter whose shadow is darker than `level`."""
     shadow = _reaching_the_border(image < level)
     if not _LEAST_SHADOW <= shadow.mean() <= 1 - _LEAST_FIELD or _dark_corners(shadow) < _LEAST_CORNERS:
@@ -245,7 +152,7 @@ def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
     sides = _sides(shadow, bright, grid)
     if not sides:
         return None
-    refined: list[_Circle | _Line] = []
+    refined: list[Ring | Line] = []
     sharp = total = 0
     seen = set()
     for side in sides:
@@ -261,31 +168,31 @@ def _fit(image: Array, level: float, grid: _Grid) -> _Fit | None:
             better = side.refitted(kept[off <= max(3 * float(np.median(off)), 0.1)])
         if np.quantile(np.abs(better.depth(kept)), 0.8) > _MOST_RESIDUAL_MM * max(1.0, 0.5 * grid.edge_mm):
             return None
-        if isinstance(better, _Circle):
+        if isinstance(better, Ring):
             apart = kept - better.middle
             seen = set(zip((apart[:, 0] > 0).tolist(), (apart[:, 1] > 0).tolist(), strict=True))
         refined.append(better)
-    if sharp < _LEAST_SHARP * total or (len(seen) < 3 and sum(isinstance(side, _Line) for side in refined) < 2):
+    if sharp < _LEAST_SHARP * total or (len(seen) < 3 and sum(isinstance(side, Line) for side in refined) < 2):
         return None
     fit = _Fit(refined, sharp / total)
     return fit if fit.inside(grid.middle[None]).all() else None
 
 
-def _edge(side: _Circle | _Line, sides: Sequence[_Circle | _Line], grid: _Grid) -> Array:
+def _edge(side: Ring | Line, sides: Sequence[Ring | Line], grid: Grid) -> Array:
     """Places (N, 2) along a side, on the detector, where the other sides leave it."""
     places = side.edge(grid.edge_mm, grid)
     here = np.all([other.depth(places) >= -grid.edge_mm for other in sides if other is not side], axis=0)
     return np.asarray(places[grid.within(places) & here])
 
 
-def _with_other_blades(fit: _Fit, image: Array, grid: _Grid) -> _Fit:
+def _with_other_blades(fit: _Fit, image: Array, grid: Grid) -> _Fit:
     """A fit with the blades whose shadow no single grey value shows: beside a bright field, scattered light fills it.
 
     Blades stand parallel or at right angles to those that were found, and all that lies beyond is darker than the field
     beside it.
     """
     sides = list(fit.sides)
-    found = [side for side in sides if isinstance(side, _Line)]
+    found = [side for side in sides if isinstance(side, Line)]
     if len(found) > _BLADES:
         return fit
     ways = [way for line in found[:1] for way in (line.normal, -line.normal, line.normal[::-1] * [-1, 1])]
@@ -296,7 +203,7 @@ def _with_other_blades(fit: _Fit, image: Array, grid: _Grid) -> _Fit:
         reach = float(np.linalg.norm(grid.middle))
         blades = []
         for beyond_middle in np.arange(_LEAST_REACH * reach, reach, _BLADE_STEP_MM):
-            line = _Line(normal, float(grid.middle @ normal + beyond_middle))
+            line = Line(normal, float(grid.middle @ normal + beyond_middle))
             kept, share = _blade(line, sides, image, grid)
             if share >= _LEAST_SHARP:
                 blades.append((len(kept), line.refitted(kept)))
@@ -307,7 +214,7 @@ def _with_other_blades(fit: _Fit, image: Array, grid: _Grid) -> _Fit:
     return replace(fit, sides=sides)
 
 
-def _blade(line: _Line, sides: list[_Circle | _Line], image: Array, grid: _Grid) -> tuple[Array, float]:
+def _blade(line: Line, sides: list[Ring | Line], image: Array, grid: Grid) -> tuple[Array, float]:
     """Where a line within all sides is a sharp edge with only shadow beyond (N, 2), and along what share of it."""
     places = line.edge(2 * grid.edge_mm, grid)
     within = np.all([side.depth(places) >= 0 for side in sides], axis=0)
@@ -324,7 +231,7 @@ def _blade(line: _Line, sides: list[_Circle | _Line], image: Array, grid: _Grid)
     return kept, float(dark.all(1).sum()) / known
 
 
-def _sharp_edge(image: Array, places: Array, outwards: Array, grid: _Grid) -> tuple[Array, int]:
+def _sharp_edge(image: Array, places: Array, outwards: Array, grid: Grid) -> tuple[Array, int]:
     """Where the image drops sharply to nearly black along an edge (N, 2): the places of half height, of how many."""
     near, far = (max(mm, pixels * grid.edge_mm) for mm, pixels in ((_NEAR_MM, 1.5), (_FAR_MM, 3.0)))
     steps = np.linspace(-far, far, 49)
@@ -360,7 +267,7 @@ def _largest(mask: Mask) -> Mask:
     return np.asarray(parts == 1 + int(counts[1:, cv2.CC_STAT_AREA].argmax()))
 
 
-def _sides(shadow: Mask, bright: Mask, grid: _Grid) -> list[_Circle | _Line]:
+def _sides(shadow: Mask, bright: Mask, grid: Grid) -> list[Ring | Line]:
     """A circle and lines that lie along the edge of a shadow, with nothing but shadow beyond them."""
     edge = bright & ~cv2.erode(bright.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     edge[:3] = edge[-3:] = False
@@ -370,70 +277,15 @@ def _sides(shadow: Mask, bright: Mask, grid: _Grid) -> list[_Circle | _Line]:
     count, places, middle = len(left), grid.places, grid.at(np.argwhere(bright)[:, ::-1]).mean(0)
     tolerance = max(_TOLERANCE_MM, 0.75 * grid.edge_mm)
     generator = np.random.default_rng(0)
-    sides: list[_Circle | _Line] = []
+    sides: list[Ring | Line] = []
     for _ in range(2 * (_MOST_SIDES + 1)):  # some may be edges of an instrument
         if len(left) < max(12, _LEAST_SHARE * count):
             break
-        best, near = _best_side(left, middle, tolerance, generator, any(isinstance(s, _Circle) for s in sides))
+        best, near = best_side(left, middle, tolerance, generator, any(isinstance(s, Ring) for s in sides))
         if best is None or near.sum() < max(12, _LEAST_SHARE * count):
             break
         left = left[~near]
         beyond = best.depth(places) < -2 * tolerance
         if beyond.any() and shadow.reshape(-1)[beyond].mean() >= _LEAST_DARK:
             sides.append(best)
-    return sides if sum(isinstance(side, _Line) for side in sides) <= _MOST_SIDES else []
-
-
-def _best_side(
-    points: Array, middle: Array, tolerance: float, generator: np.random.Generator, straight: bool
-) -> tuple[_Circle | _Line | None, Mask]:
-    """The circle or line, or line alone, that most of the points (N, 2) lie on, and which; `middle` lies inside."""
-    size = float(np.ptp(points, axis=0).max())
-    best: _Circle | _Line | None = None
-    most = np.zeros(len(points), bool)
-    for count in (2,) if straight else (2, 3):
-        chosen = points[generator.integers(len(points), size=(_TRIES, count))]
-        apart = _from_lines(chosen, points) if count == 2 else _from_circles(chosen, points, size)
-        near = apart <= tolerance  # nan, where points coincide, is not near
-        fullest = int(near.sum(1).argmax())
-        if near[fullest].sum() > most.sum() * (1 if count == 2 else _ROUNDER):
-            best, most = (_line_of if count == 2 else _circle_of)(chosen[fullest]), near[fullest]
-    if best is not None:
-        if isinstance(best, _Line) and best.depth(middle) < 0:
-            best = _Line(-best.normal, -best.offset)
-        best = best.refitted(points[most])
-        most = np.abs(best.depth(points)) <= 1.5 * tolerance
-    return best, most
-
-
-def _from_lines(pairs: Array, points: Array) -> Array:
-    """Distances (T, N) of points (N, 2) from the lines through pairs (T, 2, 2)."""
-    along = pairs[:, 1] - pairs[:, 0]
-    with np.errstate(invalid="ignore"):
-        normals = np.stack([-along[:, 1], along[:, 0]], 1) / np.linalg.norm(along, axis=1, keepdims=True)
-    return np.asarray(np.abs(normals @ points.T - (normals * pairs[:, 0]).sum(1, keepdims=True)))
-
-
-def _from_circles(triples: Array, points: Array, size: float) -> Array:
-    """Distances (T, N) of points (N, 2) from the circles through triples (T, 3, 2); nan for radii unlike `size`."""
-    (ax, ay), (bx, by) = (triples[:, 1] - triples[:, 0]).T, (triples[:, 2] - triples[:, 0]).T
-    a, b = ax**2 + ay**2, bx**2 + by**2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        to_middle = np.stack([by * a - ay * b, ax * b - bx * a], 1) / (2 * (ax * by - ay * bx))[:, None]
-        radii = np.linalg.norm(to_middle, axis=1)
-        radii[~((radii > 0.1 * size) & (radii < 2 * size))] = np.nan
-        middles = triples[:, 0] + to_middle
-        squared = (points**2).sum(1) - 2 * middles @ points.T + (middles**2).sum(1)[:, None]
-        return np.asarray(np.abs(np.sqrt(squared.clip(0)) - radii[:, None]))
-
-
-def _line_of(points: Array) -> _Line:
-    """The line through points (N, 2), by least squares."""
-    middle = points.mean(0)
-    normal = np.linalg.svd(points - middle)[2][-1]
-    return _Line(normal, float(normal @ middle))
-
-
-def _circle_of(points: Array) -> _Circle:
-    """The circle through points (N, 2)."""
-    return _Circle(*circle_through(points))
+    return sides if sum(isinstance(side, Line) for side in sides) <= _MOST_SIDES else []
