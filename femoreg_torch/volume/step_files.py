@@ -21,7 +21,7 @@ _CONVERT = (  # runs by itself: OpenCASCADE ends the whole process on many a dam
 
 
 def glb_of_step(path: Path) -> bytes:
-    """The solids of a STEP file as a GLB file in metres, each under its product's name.
+    """The solids of a STEP file as a GLB file in metres, each under the name that it has in its assembly.
 
     The unit that the file names is heeded. Raises `InputError` if the package that reads STEP is missing, or the file
     cannot be read.

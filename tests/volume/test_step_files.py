@@ -8,7 +8,7 @@ import pytest
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.intake import inspect_path
-from femoreg_torch.volume import read_bodies, read_mesh
+from femoreg_torch.volume import body_names, read_bodies, read_mesh
 from femoreg_torch.volume.step_files import glb_of_step
 
 # a sleeve of 80 mm along z, radii 1.5 and 3 mm, and a handle of 50 × 12 × 16 mm with a bore for it; by build123d 0.13
@@ -74,6 +74,19 @@ def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch)
         InputError, match=r"guide\.step: .*cascadio: pip install 'femoreg-torch\[step\]'\. Or export it as"
     ):
         glb_of_step(GUIDE)
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [((r"H\X2\00FC\X0\lse", "grip 1 / a"), ("Hülse", "grip 1 / a")), (("Body", "Body"), ("Body", "Body_1"))],
+    ids=["other letters", "one name twice"],
+)
+def test_solids_of_any_name_are_kept_apart(names: tuple[str, str], found: tuple[str, str], tmp_path: Path) -> None:
+    text = GUIDE.read_text(encoding="utf-8").replace("'sleeve'", f"'{names[0]}'").replace("'handle'", f"'{names[1]}'")
+    path = tmp_path / "guide.step"
+    path.write_text(text, encoding="utf-8")
+    assert body_names(path) == tuple(sorted(found))
+    assert read_mesh(path).volume == pytest.approx(SLEEVE_MM3 + HANDLE_MM3, rel=1e-3)
 
 
 def test_inspect_names_the_solids() -> None:
