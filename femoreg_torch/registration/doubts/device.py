@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from femoreg_torch.case import Case
+from femoreg_torch.drr import project
 from femoreg_torch.errors import in_mm
 from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.registration.evidence.besides import besides, brighter_about, rival
@@ -22,10 +23,11 @@ from femoreg_torch.volume import guide_end
 
 _CASTS_NO_SHADOW = 0.004  # 1/mm: a fifth of water
 _MOST_WITHOUT_SHADOW = 0.08  # share of a model's volume
-# Shadow, the logarithm of how much less light there is with a device, below which an image shows none, and over how
-# much of the detector it is averaged. Blocks of steel that leave scattered light alone cast one shadow whatever is in
-# them.
-_NO_SHADOW, _AVERAGED_MM = 0.15, 1.0
+# Shadow, the logarithm of how much less light there is with a device, below which an image shows none: what so little
+# would cast, but at most this, as blocks of steel that leave scattered light alone cast one shadow whatever is in them.
+# And over how much of the detector it is averaged: in dark images noise is as strong as the shadow of a thin handle.
+_NO_SHADOW, _AVERAGED_MM = 0.15, 3.0
+_STEP_MM = 1.0
 _ENCLOSED_MM = 2.5  # half of the width of a gap that counts as within: a drill in its sleeve
 # Another place of a device, of the similarity that it adds where it was found, without its best view: of wires beside
 # another one 0.44 and 0.48; of six right ones, on saturated images too, at most 0.31, mostly less than nothing.
@@ -98,7 +100,7 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
             empty &= ~_within_others(thing.volume.data >= _CASTS_NO_SHADOW, width)
             where = empty.nonzero()
             points = transform_points(thing.volume.lps_from_index, where.flip(1).double().cpu())
-            bright = _where_no_shadow_is(scene.where_unsaturated(), poses, name)
+            bright = _where_no_shadow_is(scene.where_unsaturated(), poses, name, inside)
             empty[where.unbind(1)] = in_view(bright, poses, name, points).to(empty.device)
             share = float(empty.sum() / inside.sum())
         if share > _MOST_WITHOUT_SHADOW:
@@ -109,20 +111,29 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
     return tuple(found)
 
 
-def _where_no_shadow_is(scene: Scene, poses: Poses, name: str) -> Scene:
+def _where_no_shadow_is(scene: Scene, poses: Poses, name: str, inside: Tensor) -> Scene:
     """The same with only those pixels exposed that have as much light as in the image without the device.
 
-    Images that were equalised for display are brighter all about a dark device. Where they are, that is taken off.
+    `inside` (Z, Y, X), bool, is what its model fills. Images that were equalised for display are brighter all about a
+    dark device. Where they are, that is taken off.
     """
     radius = int(_AVERAGED_MM / scene.carm.camera.mean_pixel_mm / 2)
+    filled = replace(scene.objects[name].volume, data=inside.to(scene.objects[name].volume.data))
+
+    def averaged(image: Tensor) -> Tensor:
+        return avg_pool2d(image[None], 2 * radius + 1, 1, radius, count_include_pad=False)[0]
 
     def left(kind: Kind, view: int) -> Tensor | None:
         exposed, first = scene.field(kind, view), scene.first_kind
         if kind == first or not (scene.there([first], [view]) and scene.there([kind], [view])):
             return exposed
+        placed = poses.camera_from(name)[view][None, None]
+        path_mm = project([filled], placed, poses.camera(view, scene.carm.camera), _STEP_MM)[0]
         shadow = scene.image(kind, view) - scene.image(first, view)
         shadow = shadow - brighter_about(scene, poses, name, kind, view)
-        bright = avg_pool2d(shadow[None], 2 * radius + 1, 1, radius, count_include_pad=False)[0] < _NO_SHADOW
+        own = (path_mm > 0).to(shadow)
+        shadow = averaged(shadow * own) / averaged(own).clip(1e-6)  # not of what lies beside it
+        bright = shadow < (_CASTS_NO_SHADOW * path_mm).clip(max=_NO_SHADOW)
         return bright if exposed is None else exposed & bright
 
     return replace(scene, fields={kind: tuple(left(kind, v) for v in range(scene.views)) for kind in scene.images})

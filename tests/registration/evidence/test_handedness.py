@@ -127,6 +127,20 @@ def test_a_part_in_whose_place_all_images_show_a_shadow_is_not_missing(scene: Sc
     assert doubts_about_the_models(scene, replace(estimated, images=shown(scene).images), TRUTH) == ()
 
 
+def test_a_faint_part_in_noise_is_not_missing(scene: Scene) -> None:
+    """A handle of light plastic, two thirds of whose contrast are lost in images for display, and much noise.
+
+    What is estimated of it may be as good as nothing.
+    """
+    faint, estimated = VOLUMES["device"].data.clone(), VOLUMES["device"].data.clone()
+    faint[:, :, 15:], estimated[:, :, 15:] = 0.006, 0.001
+    images = shown(with_volume(scene, "device", VOLUMES["device"].with_data(faint))).images
+    random = torch.Generator().manual_seed(0)
+    noisy = [image + 0.1 * torch.randn(image.shape, generator=random) for image in images["device"]]
+    there = replace(with_volume(scene, "device", VOLUMES["device"].with_data(estimated)), images=images)
+    assert doubts_about_the_models(scene, replace(there, images={**images, "device": tuple(noisy)}), TRUTH) == ()
+
+
 def test_a_drill_in_its_sleeve_need_cast_no_shadow_of_its_own(scene: Scene) -> None:
     """The images tell the two together; of one that stands out of its sleeve, or of a handle, they tell each part."""
     y, x = torch.meshgrid(torch.arange(40) - 19.5, torch.arange(40) - 19.5, indexing="ij")
