@@ -44,6 +44,7 @@ _REFUSED = re.compile(
 _KEY = re.compile(r'Parser key "([^"]*)": (.*)')
 _WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text"}
 _WORDS_OF_MANY = {"int": "whole numbers", "float": "numbers", "str": "texts", "Path": "paths"}
+_CHOICE = re.compile(r"typing\.Literal\[(.*)\]")
 LIST = "a list"  # how `told` begins where one was expected
 
 
@@ -58,12 +59,13 @@ def told(error: Exception) -> str:
 
 def _in_words(found: re.Match[str]) -> str:
     kinds = found[1] or found[2]
-    if choice := re.fullmatch(r"typing\.Literal\[(.*)\]", kinds):
+    if choice := _CHOICE.fullmatch(kinds):
         kinds = f"one of {choice[1]}"
     elif listed := re.fullmatch(r"list(?:\[(?:\w+\.)*(\w+)\])?", kinds):
         kinds = f"{LIST}{f' of {_WORDS_OF_MANY[listed[1]]}' if listed[1] in _WORDS_OF_MANY else ''}"
     else:
-        kinds = ", ".join(_WORDS.get(kind, kind) for kind in kinds.split(", "))
+        words = [_WORDS.get(kind, _CHOICE.sub(r"\1", kind)) for kind in kinds.split(", ")]
+        kinds = " or ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
     return f"{kinds} was expected, found {shortened(found[3])}"
 
 

@@ -12,6 +12,7 @@ import atexit
 import gc
 import inspect
 import io
+import itertools
 import os
 import re
 import sys
@@ -237,7 +238,7 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
     from jsonargparse import ArgumentError
 
     from femoreg_torch.settings import LIST, told
-    from femoreg_torch.text import check_no_aliases
+    from femoreg_torch.text import check_no_aliases, read_yaml
 
     for word in arguments:
         option, _, value = word.partition("=") if word.startswith("--") else ("", "", word)
@@ -248,6 +249,11 @@ def _parse(function: Callable[..., Any], name: str, arguments: list[str]) -> dic
     if twice := next((word for word in options if options.count(word) > 1), None):
         raise InputError(f"{name}: {shortened(twice)} stands there twice. Keep one.")
     parser = parser_of(function, name)
+    if "config" not in get_type_hints(function):
+        for here, after in itertools.pairwise([*arguments, ""]):
+            option, equals, value = here.partition("=")
+            if option == "--config":
+                read_yaml(Path(value if equals else after))  # which says what is wrong, and where
     try:
         values = parser.instantiate(parser.parse_args(arguments))
     except (ArgumentError, TypeError, ValueError, OSError) as error:  # OSError: a file of options that cannot be read

@@ -106,12 +106,19 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str | None = None, se
     from rich.console import Console
     from rich.markup import escape
 
-    from femoreg_torch.anatomy import HIP
+    from femoreg_torch.anatomy import HIP, label_table_names
     from femoreg_torch.commands.telling import tell
     from femoreg_torch.errors import InputError
     from femoreg_torch.intake.label_tables import table_of_map
     from femoreg_torch.segment import propose_landmarks
-    from femoreg_torch.volume import bone_labels, read_ct_told, read_labels_told, swapped_sides, write_landmarks
+    from femoreg_torch.volume import (
+        bone_labels,
+        has_names,
+        read_ct_told,
+        read_labels_told,
+        swapped_sides,
+        write_landmarks,
+    )
 
     if not out.name.lower().endswith(".json"):
         raise InputError(f"{out}: the name is to end in .mrk.json or .json.")
@@ -126,6 +133,12 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str | None = None, se
         found = propose_landmarks(volume, known)
     if not found.points:
         raise InputError(f"{labels}: no landmark could be found on its bones. Look at it with `femoreg inspect`.")
+    swapped = swapped_sides(known, found.points, HIP)
+    if swapped and bones is None and not has_names(labels):
+        raise InputError(
+            f"{labels}: read with the ids of `femoreg segment`, left and right are swapped, or its ids are of another "
+            f"table. Say which: --bones {', '.join(label_table_names())}, or a YAML file."
+        )
     write_landmarks(out, found.points)
     for note in (*told, *parts, *more):
         console.print(f"  {escape(note)}", highlight=False)
@@ -136,6 +149,6 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str | None = None, se
         console.print(f"  {side} femoral head: radius {radius:.1f} mm, {residual:.2f} mm off a sphere", highlight=False)
     for name, why in found.left_out.items():
         console.print(f"[yellow]Left out:[/] {name}: {why}.", highlight=False)
-    for warning in (*found.warnings, *swapped_sides(known, found.points, HIP)):
+    for warning in (*found.warnings, *swapped):
         tell(console, "Warning", warning)
     console.print(f"Landmarks: {escape(str(out))}. Look at them in 3D Slicer and correct them.", highlight=False)

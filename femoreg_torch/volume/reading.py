@@ -153,10 +153,12 @@ def read_labels_told(path: Path, like: Volume, ids: Collection[int] | None = Non
     """A label map on the grid of `like`, and what had to be done to it in words.
 
     A map on another grid is resampled by nearest neighbour. Of a segmentation whose parts have names, only those with
-    the values `ids` are read; None: all. Raises `InputError` as `read_label_map` does, and for a map of which nothing
-    lies in the CT.
+    the values `ids` are read; None: all. Raises `InputError` as `read_label_map` does, and for a map that is empty,
+    or of which nothing lies in the CT.
     """
     labels, told = _label_map_told(Path(path), ids)
+    if not labels.data.any():
+        raise InputError(f"{path}: the label map is empty: no voxel has a label. Export it anew.")
     if labels.data.shape == like.data.shape:
         corners = torch.cartesian_prod(
             *(torch.tensor([0.0, n - 1], dtype=torch.float64) for n in like.data.shape[::-1])
@@ -169,7 +171,7 @@ def read_labels_told(path: Path, like: Volume, ids: Collection[int] | None = Non
     moved = Volume(torch.from_numpy(sitk.GetArrayFromImage(grid)), like.lps_from_index)
     labelled = int(labels.data.count_nonzero()) * float(np.prod(labels.spacing_mm))
     kept = int(moved.data.count_nonzero()) * float(np.prod(like.spacing_mm))
-    if labelled and not kept:
+    if not kept:
         raise InputError(
             f"{path}: nothing of the label map lies in the CT. Check that both are of the same scan, and for RAS/LPS "
             "mix-ups."

@@ -205,12 +205,15 @@ def test_options_out_of_range_are_one_line(option: str, tmp_path: Path, capsys: 
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, "out: !!bool abc", "a: &a [*a]", "out: run\nout: walk"])
-def test_broken_option_files_are_one_line(tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "options.yaml").write_text(text, encoding="utf-8")
+@pytest.mark.parametrize("text", ["[" * 100_000, "out: !!bool abc", "a: &a [*a]", "out: run\nout: walk", "\xe7: [", ""])
+def test_broken_option_files_are_one_line_that_names_them(
+    tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "options.yaml").write_bytes(text.encode("latin-1"))
     assert main(["measure", "a.png", "--config", str(tmp_path / "options.yaml")]) == 2
     error = capsys.readouterr().err
     assert error.startswith("femoreg: ")
+    assert str(tmp_path / "options.yaml") in error
     assert error.count("\n") == 1
     assert len(error) < 2100
 

@@ -486,6 +486,21 @@ def test_a_table_that_is_not_that_of_the_map_is_told_with_the_one_that_is(
     assert main(["landmarks", ct, str(path), "--out", out, "--bones", "totalsegmentator_v2"]) == 0
 
 
+def test_ids_that_are_taken_for_those_of_segment_are_doubted_where_left_and_right_are_swapped(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those of another table may be among them, and then mean other bones."""
+    table, values = label_table("femoreg"), np.zeros(next(iter(bones().values())).shape, np.uint8)
+    others = {"hip_left": "hip_right", "hip_right": "hip_left"}
+    for name, mask in bones().items():
+        values[mask] = table[others.get(name, name)][0]
+    path, out = tmp_path / "map.nii.gz", tmp_path / "points.mrk.json"
+    nibabel.save(nibabel.Nifti1Image(values, ras_affine()), path)
+    assert main(["landmarks", str(files / "ct.nii.gz"), str(path), "--out", str(out)]) == 2
+    assert "left and right are swapped, or its ids are of another table. Say which: --bones" in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_a_path_beside_a_ct_without_a_place_is_told_with_that(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -394,6 +394,8 @@ def wrong_labels(kind: str) -> sitk.Image:
     labels = label_image()
     if kind == "elsewhere":
         labels.SetOrigin((40.0, -13.0, 200.0))
+    if kind == "empty":
+        return labels * 0
     if kind == "fractions":
         return sitk.Cast(labels, sitk.sitkFloat32) * 0.9
     if kind == "negative":
@@ -407,6 +409,7 @@ def wrong_labels(kind: str) -> sitk.Image:
     ("kind", "message"),
     [
         ("elsewhere", "nothing of the label map lies in the CT"),
+        ("empty", "is empty: no voxel has a label"),
         ("fractions", "whole numbers"),
         ("negative", "whole numbers"),
         ("too large", "whole numbers from 0 to 65535 was expected, found 0 to 65540"),

@@ -77,18 +77,23 @@ class _Ends:
 class _Cut:
     """An object cut in two, and what images say of where its ends lie."""
 
+    name: str
     names: tuple[str, str]  # of the ends
     ends: _Ends
     whole: tuple[ImageCosts, ...]  # of the object in one piece, by level
+
+    def placed(self, poses: Poses) -> Poses:
+        """With both ends where the object lies in one piece."""
+        for each in self.names:
+            poses = poses.with_object(each, poses.camera1_from[self.name])
+        return poses
 
     def asked(self, poses: Poses, number: int) -> tuple[tuple[Body, ...], ImageCosts]:
         """The ends as bodies, and what images at the level of this number say of their motions."""
         level = _LEVELS[number]
         bodies = tuple(_body(poses, *end) for end in zip(self.names, self.ends.points, strict=True))
         parts = [replace(end, volume=level.volume(end.volume, sharp=end.sharp)) for end in self.ends.objects]
-        whole = self.whole[number]
-        (name,) = {of for body in whole.bodies for of in body.objects}
-        return bodies, whole.in_parts(name, dict(zip(self.names, parts, strict=True)), poses, bodies)
+        return bodies, self.whole[number].in_parts(self.name, dict(zip(self.names, parts, strict=True)), poses, bodies)
 
     def fitted(self, poses: Poses, ways: Tensor) -> "_Fitted":
         """Where the ends fit, from their poses, as far as they go along some ways (12, n)."""
@@ -150,13 +155,10 @@ def bend(
 
     None where the images show too little of one end, or nothing of them is exposed.
     """
-    ends = _ends(scene, poses, name, share, _shown_in(scene, name))
-    if ends is None or images is None:
+    cut = _cut(scene, poses, name, share, images)
+    if cut is None:
         return None
-    cut = _Cut((f"{name}, one end", f"{name}, the other"), ends, images)
-    uncut = poses
-    for each in cut.names:
-        uncut = uncut.with_object(each, poses.camera1_from[name])
+    uncut = cut.placed(poses)
     _, costs = cut.asked(uncut, -1)
     found = cut.fitted(uncut, cut.ways(uncut, "all"))
     if turns != "all":
@@ -173,6 +175,27 @@ def bend(
     )
     gain = float(costs(costs.still[None]).mean()) - found.cost
     return Bend(motion, covariance.diagonal().sqrt(), apart, deviation, gain)
+
+
+def gain_as_one(scene: Scene, poses: Poses, name: str, share: float, images: tuple[ImageCosts, ...] | None) -> float:
+    """What of the similarity an object gains that moves as one, where `bend` cuts it; nothing where that is None."""
+    cut = _cut(scene, poses, name, share, images)
+    if cut is None:
+        return 0.0
+    uncut = cut.placed(poses)
+    bodies, costs = cut.asked(uncut, -1)
+    at_first = _at(bodies[0].centre, bodies[0])
+    as_one = torch.cat(
+        [torch.eye(6, dtype=torch.float64), torch.linalg.solve(_at(bodies[0].centre, bodies[1]), at_first)]
+    )
+    return float(costs(costs.still[None]).mean()) - cut.fitted(uncut, as_one).cost
+
+
+def _cut(scene: Scene, poses: Poses, name: str, share: float, images: tuple[ImageCosts, ...] | None) -> _Cut | None:
+    ends = _ends(scene, poses, name, share, _shown_in(scene, name))
+    if ends is None or images is None:
+        return None
+    return _Cut(name, (f"{name}, one end", f"{name}, the other"), ends, images)
 
 
 def _about(bodies: Sequence[Body], axes: Sequence[Tensor]) -> Tensor:

@@ -15,7 +15,7 @@ from femoreg_torch.optimize import levenberg
 from femoreg_torch.registration import Scene
 from femoreg_torch.registration.doubts import shape
 from femoreg_torch.registration.doubts.shape import doubts_about_rigidity
-from femoreg_torch.registration.evidence.rigidity import CUTS, Bend, Turns, bend, images_of
+from femoreg_torch.registration.evidence.rigidity import CUTS, Bend, Turns, bend, gain_as_one, images_of
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.scene import RigidObject
 from femoreg_torch.volume import Volume, axis_aligned
@@ -111,6 +111,28 @@ def test_a_model_of_unknown_materials_is_bent_only_where_that_is_sure_and_explai
     device = scene.objects["device"]
     asked = replace(scene, objects=scene.objects | {"device": replace(device, parts=(device.volume,))})
     assert len(doubts_about_rigidity(asked, TRUTH, PLAIN)) == told
+
+
+def test_what_lies_elsewhere_as_a_whole_gains_by_that_alone(scene: Scene) -> None:
+    by = rigid(translation=torch.tensor([0.4, 0.4, 0.0], dtype=torch.float64))
+    aside = TRUTH.with_object("device", by @ TRUTH.camera1_from["device"])
+    found = bent(scene, aside, "device", 0.5)
+    assert found is not None
+    assert found.gain > 0.001
+    as_one = gain_as_one(scene, aside, "device", 0.5, images_of(scene, aside, "device", PLAIN))
+    assert as_one == pytest.approx(found.gain, rel=0.05)
+
+
+def test_a_model_of_unknown_materials_must_gain_by_its_ends(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Coarse images of two right devices gained 0.033 by another pose of the whole, and 0.0008 by their ends."""
+    motion = torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64)
+    device = scene.objects["device"]
+    asked = replace(scene, objects=scene.objects | {"device": replace(device, parts=(device.volume,))})
+    for gain, as_one, told in ((0.033, 0.0322, 0), (0.033, 0.0318, 1), (0.0025, 0.0018, 1)):
+        ends = Bend(motion, motion.abs() / 9 + 1e-9, 1.2, 0.3, gain)
+        monkeypatch.setattr(shape, "bend", lambda *asked, ends=ends: ends if asked[2] == "device" else None)
+        monkeypatch.setattr(shape, "gain_as_one", lambda *_, as_one=as_one: as_one)
+        assert len(doubts_about_rigidity(asked, TRUTH, PLAIN)) == told, (gain, as_one)
 
 
 def test_an_end_that_no_two_views_show_is_not_asked(scene: Scene) -> None:
