@@ -30,7 +30,7 @@ from femoreg_torch.registration.quality import Limits, assess, assess_cameras, f
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.registration.start.another_view import start_from_a_view
 from femoreg_torch.registration.start.by_hand import start_by_landmarks
-from femoreg_torch.registration.start.display_told import doubts_about_the_display
+from femoreg_torch.registration.start.display_told import doubts_about_head_up, doubts_about_the_display
 from femoreg_torch.registration.start.find import Detector, look_at, with_segmentations
 from femoreg_torch.registration.turn_search import turned_from_where_told
 from femoreg_torch.registration.workflow import Follow, Report, run_plan
@@ -199,10 +199,12 @@ def register_scene(
         seed=seed,
         versions=versions(),
     )
-    if not result.verdict.trusted and told.needs_landmarks and landmarks is None:
-        assert look is not None  # it found the start
-        report("asking how view 1 was taken", 1.0)
-        why = doubts_about_the_display(case, told, plan, look, outcome.trace, seed)
+    if not result.verdict.trusted and told.needs_landmarks:
+        why = doubts_about_head_up(case.display_of(0), outcome.poses.camera1_from[scene.anchor])
+        if landmarks is None and not why:
+            assert look is not None  # it found the start
+            report("asking how view 1 was taken", 1.0)
+            why = doubts_about_the_display(case, told, plan, look, outcome.trace, seed)
         result = replace(result, doubts=(*why, *result.doubts))
     return result, scene
 

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import takewhile
 
+from torch import Tensor
+
 from femoreg_torch.anatomy import HIP
 from femoreg_torch.case import Case, StageRecord
 from femoreg_torch.cores import on_all_cores
@@ -27,6 +29,8 @@ from femoreg_torch.registration.workflow import run_plan
 # front and behind, told and not, the right display fitted better than any other by 0.08 to 0.11. In one more, whose
 # start was wrong (a pelvis 17° off), a wrong display did by 0.06.
 _BETTER = 0.07
+# Cosine of the angle between the way to the head and down the picture: inlet and outlet views tilt by 45° at most.
+_HEAD_DOWN = 0.5
 _FRONT_AND_BACK: tuple[Source, ...] = ("anterior", "posterior")  # views from a side start from the same side alone
 
 
@@ -60,6 +64,17 @@ def doubts_about_the_display(
         f"view 1 fits better as one whose source stands {stands} the patient{mirrored} (similarity "
         f"{1 - costs[best]:.2f} against {1 - ended[-1]:.2f} as the case tells it), which may be what other doubts "
         "come from: check `display` of the views, and whether the CT is mirrored",
+    )
+
+
+def doubts_about_head_up(display: Display, camera1_from_ct: Tensor) -> tuple[str, ...]:
+    """In words, whether the patient stands head down in view 1, at a pose (4, 4) of the CT's LPS, as it was told."""
+    if float(camera1_from_ct[1, 2]) < _HEAD_DOWN:
+        return ()
+    turned = (display.turned_deg + 180) % 360
+    return (
+        f"in view 1 the patient stands head down: is its picture turned by {turned}°, and not by {display.turned_deg}° "
+        "(`display`)? Nominal poses of a device, axes and sides are told for a picture that stands head up",
     )
 
 

@@ -14,7 +14,7 @@ from femoreg_torch.fluoro import Display
 from femoreg_torch.pnp import PnpResult
 from femoreg_torch.registration import load_plan
 from femoreg_torch.registration.start import display_told
-from femoreg_torch.registration.start.display_told import doubts_about_the_display
+from femoreg_torch.registration.start.display_told import doubts_about_head_up, doubts_about_the_display
 from femoreg_torch.registration.start.find import Start
 
 TRUTH = true_poses()
@@ -70,3 +70,19 @@ def test_a_display_that_fits_no_better_is_not_named(monkeypatch: pytest.MonkeyPa
     assert doubts_of(monkeypatch, *behind, cost=0.0) == ()  # nothing can fit better
     assert doubts_of(monkeypatch, *behind, cost=0.9, start=False) == ()
     assert doubts_of(monkeypatch, Display("posterior"), Display("left"), cost=0.9) == ()
+
+
+@pytest.mark.parametrize(("turned", "right"), [(0, 180), (90, 270), (270, 90)])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_picture_told_the_wrong_way_up_is_named_with_its_turn(turned: int, right: int, mirrored: bool) -> None:
+    """The pose is the one that a true picture gives after it was set upright as it was told."""
+    true = Display(mirrored=mirrored, turned_deg=right)
+    told = replace(true, turned_deg=turned)
+    stored = true.to_stored(make_scene(TRUTH).image("anatomy", 0))
+    shown = told.to_camera(stored)
+    assert torch.equal(shown, true.to_camera(stored).flip(0, 1)), "half a turn of what the source saw"
+    pose = torch.tensor([[1.0, 0, 0, 10], [0, 0, -1, 20], [0, 1, 0, 700], [0, 0, 0, 1]], dtype=torch.float64)
+    assert doubts_about_head_up(true, pose) == ()
+    pose[:2] *= -1
+    (doubt,) = doubts_about_head_up(told, pose)
+    assert f"is its picture turned by {right}°, and not by {turned}°" in doubt
