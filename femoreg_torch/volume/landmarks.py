@@ -191,7 +191,7 @@ def _points(path: Path) -> list[tuple[str, Tensor]]:
         points = (_slicer_points if "markups" in content else _plain_points)(content, path)
     found = []
     for number, point in enumerate(points, 1):
-        name = point.label.strip() if isinstance(point.label, str) else ""
+        name = str(point.label).strip() if isinstance(point.label, str | int | float) else ""
         signs = torch.tensor(_signs(point.space, f"{path}, coordinate system"), dtype=torch.float64)
         told = _told(name) if name else f"point {number} (no name)"
         found.append((name, _point(point.position, f"{path}, {point.line}{told}") * signs))

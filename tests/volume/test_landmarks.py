@@ -132,6 +132,10 @@ def test_written_landmarks_come_back(tmp_path: Path, name: str) -> None:
 
 BAD = {
     "unknown name": (json.dumps(plain(landmarks={"FH-x": HEAD})), "unknown landmark 'FH-x'"),
+    "number for a name": (
+        json.dumps(slicer("LPS", HEAD, NOTCH, controlPoints=[{"label": 5, "position": HEAD}])),
+        "unknown landmark '5'",
+    ),
     "centimetres": (json.dumps(plain(unit="cm")), "unit must be mm, found 'cm'"),
     "no unit": (json.dumps({"space": "LPS", "landmarks": {}}), "`unit` is missing"),
     "no landmarks": (json.dumps({"space": "LPS", "unit": "mm"}), "`landmarks` is missing"),
