@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 import torch
@@ -259,25 +260,27 @@ def turned_labels(ct: Volume, labels: Volume) -> str | None:
     if not len(where):
         return None
     where = where[:: 1 + len(where) // _MOST_PLACES].double()
-    to_index = torch.linalg.inv(ct.lps_from_index)
-    points = transform_points(ct.lps_from_index, where)
-    middle = points.mean(0)
-    last = torch.tensor(ct.data.shape).flip(0) - 1
+    directions, middle = ct.lps_from_index[:3, :3], where.mean(0)
+    arms, to_index = (where - middle) @ directions.T, torch.linalg.inv(directions)
+    values, size = ct.data.reshape(-1), torch.tensor(ct.data.shape)
+    last, strides = (size - 1).flip(0).double(), torch.tensor([1, int(size[2]), int(size[1] * size[2])])
 
     def mean(motion: Tensor) -> float:
-        """By a turn, degrees along LPS, and a shift, mm (6,)."""
-        moved = (points - middle) @ exp_so3(torch.deg2rad(motion[:3])).T + middle + motion[3:]
-        x, y, z = transform_points(to_index, moved).round().long().clamp_min(0).minimum(last).T
-        return float(ct.data[z, y, x].float().clamp(*_TOLD_HU).mean())
+        """By a turn about the middle of the labels, degrees along LPS, and a shift, mm (6,)."""
+        turn = to_index @ exp_so3(torch.deg2rad(motion[:3]))
+        moved = torch.addmm(middle + to_index @ motion[3:], arms, turn.T)
+        places = (moved.round_().clamp_min_(0).minimum(last).long() * strides).sum(1)
+        return float(values[places].float().clamp(*_TOLD_HU).mean())
 
     units = torch.eye(6, dtype=torch.float64)
     best = torch.zeros(6, dtype=torch.float64)
+    here = found = mean(best)
     for step in _TURN_STEPS_DEG:
         for way in [*units, *units]:
             apart = way * torch.where(way.argmax() < 3, step, _SHIFT_BY_TURN * step)
-            best = max((best + n * apart for n in (0, -1, 1, -2, 2)), key=mean)
+            tried = [best + n * apart for n in (-1, 1, -2, 2)]
+            found, best = max([(found, best), *((mean(each), each) for each in tried)], key=itemgetter(0))
     turn = best[:3]
-    here, found = mean(torch.zeros_like(best)), mean(best)
     aside = sum(mean(sign * _QUICK_REACH_MM * way) for way in units[3:] for sign in (-1, 1)) / 6
     lies_there = float(turn.norm()) < _LEAST_TURN_DEG or found - here < _LEAST_RISE * abs(here - aside)
     if lies_there or mean(-best) > here - 0.25 * (found - here):  # the latter of too small labels, as above

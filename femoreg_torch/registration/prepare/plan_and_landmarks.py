@@ -41,22 +41,31 @@ def heads_near_landmarks(case: Case, bones: BoneLabels) -> dict[str, "Head"]:
     return {name: head for name, head in found.items() if head is not None}
 
 
-def doubts_about_the_files(case: Case, ct: Volume, bones: BoneLabels, heads: Mapping[str, "Head"]) -> tuple[str, ...]:
-    """All that CT, landmarks and plan say against the label map, which lies on the CT's grid, in words."""
-    told = []
+def doubts_about_the_labels(ct: Volume, bones: BoneLabels) -> tuple[str, ...]:
+    """What a CT says against where its label map lies, which is on its grid, in words."""
     turned = turned_labels(ct, bones.labels)
     if turned is not None:
-        told.append(turned)
-    elif (shift := shifted_labels(ct, bones.labels)) is not None:
-        by = ", ".join(f"{mm + 0.0:.0f}" for mm in shift.tolist())
-        told.append(
-            f"the label map would lie on the bones of the CT if it were moved by ({by}) mm LPS: check that it belongs "
-            "to this CT, and the origin of both"
-        )
+        return (turned,)
+    shift = shifted_labels(ct, bones.labels)
+    if shift is None:
+        return ()
+    by = ", ".join(f"{mm + 0.0:.0f}" for mm in shift.tolist())
+    return (
+        f"the label map would lie on the bones of the CT if it were moved by ({by}) mm LPS: check that it belongs "
+        "to this CT, and the origin of both",
+    )
+
+
+def doubts_about_the_slices(ct: Volume, bones: BoneLabels) -> tuple[str, ...]:
+    """Slices that a CT seems to lack, in words."""
     lost = told_of_lost_slice(ct, bones.labels, list(bones.ids.values()))
-    told += [] if lost is None else [lost]
-    told += doubts_about_bare_bone(case, ct, bones)
-    return (*told, *doubts_about_the_frame(case, bones, heads), *doubts_about_the_ends(case, bones))
+    return () if lost is None else (lost,)
+
+
+def doubts_about_the_points(case: Case, ct: Volume, bones: BoneLabels, heads: Mapping[str, "Head"]) -> tuple[str, ...]:
+    """What bones and femoral heads of the label map say against landmarks and plan, in words."""
+    bare = doubts_about_bare_bone(case, ct, bones)
+    return (*bare, *doubts_about_the_frame(case, bones, heads), *doubts_about_the_ends(case, bones))
 
 
 def doubts_about_bare_bone(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """From a case on disk to the scene that is registered."""
 
 from concurrent.futures import ThreadPoolExecutor
+from itertools import chain
 
 import torch
 
@@ -12,7 +13,9 @@ from femoreg_torch.registration.prepare.models import ModelVolumes, model_attenu
 from femoreg_torch.registration.prepare.nominal import check_points, check_starts
 from femoreg_torch.registration.prepare.outline import outline_of
 from femoreg_torch.registration.prepare.plan_and_landmarks import (
-    doubts_about_the_files,
+    doubts_about_the_labels,
+    doubts_about_the_points,
+    doubts_about_the_slices,
     heads_near_landmarks,
     notes_on_the_slices,
 )
@@ -53,7 +56,8 @@ def prepare_scene(case: Case) -> Scene:
         if from_ct:
             ct, bones = read_bones(case)
             outlining = beside.submit(outline_of, bones, case.anatomy)
-            looking = beside.submit(_told_of_files, case, ct, bones)
+            heeding = beside.submit(_told_of_points, case, ct, bones)
+            looking = [beside.submit(ask, ct, bones) for ask in (doubts_about_the_labels, doubts_about_the_slices)]
             check_inside(case.landmarks, ct)
             told_of_ct = (*bones.notes, *_check_anatomy(case, ct, bones))
             _check_path(case, ct)
@@ -61,9 +65,10 @@ def prepare_scene(case: Case) -> Scene:
             tissue = soft.with_data(hu_to_attenuation(soft.data, -1000.0))
         images, fields, bright, told = reading.result()
         if from_ct:
-            contradictions, told_of_slices = looking.result()
-            told = (*told_of_ct, *told_of_slices, *told)
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
+            of_points, told_of_slices = heeding.result()
+            contradictions = *chain(*(each.result() for each in looking)), *of_points
+            told = (*told_of_ct, *told_of_slices, *told)
             outline = outlining.result()
         made = {name: model.result() for name, model in making.items()}
     for name, (volumes, axis) in made.items():
@@ -114,10 +119,10 @@ def _check_anatomy(case: Case, ct: Volume, bones: BoneLabels) -> tuple[str, ...]
     return (*filter(None, [elsewhere, seen.windowed]), *landmarks_without_bones(bones, case.landmarks, case.anatomy))
 
 
-def _told_of_files(case: Case, ct: Volume, bones: BoneLabels) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What speaks against CT, label map, landmarks and plan, and what is noted of the slices, in words."""
+def _told_of_points(case: Case, ct: Volume, bones: BoneLabels) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What speaks against landmarks and plan, and what the femoral heads say of the slices, in words."""
     heads = heads_near_landmarks(case, bones)
-    return doubts_about_the_files(case, ct, bones, heads), notes_on_the_slices(bones, heads)
+    return doubts_about_the_points(case, ct, bones, heads), notes_on_the_slices(bones, heads)
 
 
 def _check_path(case: Case, ct: Volume) -> None:

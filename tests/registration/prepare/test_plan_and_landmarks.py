@@ -14,8 +14,10 @@ from femoreg_torch.case.femoroplasty import planned
 from femoreg_torch.geometry import load_carm
 from femoreg_torch.registration.prepare.plan_and_landmarks import (
     doubts_about_the_ends,
-    doubts_about_the_files,
     doubts_about_the_frame,
+    doubts_about_the_labels,
+    doubts_about_the_points,
+    doubts_about_the_slices,
     heads_near_landmarks,
     notes_on_the_slices,
 )
@@ -55,7 +57,8 @@ def told_of_frame(of: Case, there: BoneLabels) -> tuple[str, ...]:
 
 
 def told_of_files(of: Case, ct: Volume, there: BoneLabels) -> tuple[str, ...]:
-    return doubts_about_the_files(of, ct, there, heads_near_landmarks(of, there))
+    of_points = doubts_about_the_points(of, ct, there, heads_near_landmarks(of, there))
+    return (*doubts_about_the_labels(ct, there), *doubts_about_the_slices(ct, there), *of_points)
 
 
 @pytest.mark.parametrize(("beside_mm", "told"), [(0, 0), (3, 0), (8, 1), (30, 0)])  # the last is told elsewhere
