@@ -132,8 +132,8 @@ def _where_no_shadow_is(scene: Scene, poses: Poses, name: str, inside: Tensor) -
         shadow = scene.image(kind, view) - scene.image(first, view)
         shadow = shadow - brighter_about(scene, poses, name, kind, view)
         own = (path_mm > 0).to(shadow)
-        shadow = averaged(shadow * own) / averaged(own).clip(1e-6)  # not of what lies beside it
-        bright = shadow < (_CASTS_NO_SHADOW * path_mm).clip(max=_NO_SHADOW)
+        shadow = averaged(shadow * own) / averaged(own).clamp_min(1e-6)  # not of what lies beside it
+        bright = shadow < (_CASTS_NO_SHADOW * path_mm).clamp_max(_NO_SHADOW)
         return bright if exposed is None else exposed & bright
 
     return replace(scene, fields={kind: tuple(left(kind, v) for v in range(scene.views)) for kind in scene.images})
