@@ -39,10 +39,12 @@ def doubts_about_the_images(scene: Scene, poses: Poses, imaging: Imaging) -> tup
                 "views (from camera 1 to that view's, in mm, not the inverse), and that the image shows the same hip"
             )
         else:
+            others = len(scene.there([found.kind], range(scene.views))) - 1
+            without = "; or register without that view" if others > 1 else ""
             told.append(
                 f"{what} fits nowhere within {ORBIT_DEG:.0f}° of view 1 {beside}: check that it shows the same hip of "
                 "the same patient, and that little covers it; a C-arm that stood elsewhere needs its poses "
-                "(`camera_from_camera1` of the views)"
+                f"(`camera_from_camera1` of the views){without}"
             )
     return tuple(told)
 

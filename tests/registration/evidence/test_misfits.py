@@ -87,7 +87,7 @@ def test_device_images_that_were_exchanged(scene: Scene) -> None:
 
 def test_images_of_something_else(scene: Scene) -> None:
     noise = torch.rand(scene.image("anatomy", 1).shape, generator=torch.Generator().manual_seed(3))
-    for kind, says in (("anatomy", "fits nowhere within 100°"), ("device", "no images are exchanged")):
+    for kind, says in (("anatomy", "or register without that view"), ("device", "no images are exchanged")):
         (found,) = misfits(with_image(scene, kind, 1, noise), TRUTH, PLAIN)
         assert (found.kind, found.view, found.as_view, found.as_stored) == (kind, 1, None, None)
         assert found.similarity < 0.2 < found.in_view_1
