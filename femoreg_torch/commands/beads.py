@@ -84,5 +84,5 @@ def beads_table(trials: Path, *, run: str = "run") -> None:
     rows = rows_of_trials(read_trials(trials, run), trials.resolve().name)
     write_rows(rows, trials / TRIALS_NAME)
     console = Console()
-    console.print(for_terminal(trial_table(rows)))
+    console.print(for_terminal(trial_table(rows), console.width))
     console.print(f"Rows: {trials / TRIALS_NAME}", markup=False, highlight=False, soft_wrap=True)

@@ -39,7 +39,7 @@ def tables(study: Path, *, beside: Path | None = None, seed: int = 0) -> None:
     console = Console()
     shown = next((own for name, own in found.items() if name), [])
     for table in (*common, *shown):
-        console.print(for_terminal(table))
+        console.print(for_terminal(table, console.width))
     conditions = len(found) - 2
     if conditions > 1:
         console.print(f"These are of all runs; the tables of {conditions} conditions are in the files.", style="dim")

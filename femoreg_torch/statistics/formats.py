@@ -9,8 +9,10 @@ from typing import Literal
 
 import pandas as pd
 from rich import box
+from rich.console import Group
 from rich.markup import escape as escape_markup
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from femoreg_torch.files import write_text
 
@@ -43,7 +45,7 @@ def number(value: float, digits: int, sign: Literal["+", "-"] = "-") -> str:
     """A number for a cell: – if it is not known, ∞ if it is infinite. `sign` + tells that of positive numbers too."""
     if math.isnan(value):
         return "–"
-    return f"{value:{sign}.{digits}f}".replace("-", "−") if math.isfinite(value) else "∞"
+    return f"{value:{sign}z.{digits}f}".replace("-", "−") if math.isfinite(value) else "∞"
 
 
 def between(interval: tuple[float, float], digits: int) -> str:
@@ -138,25 +140,54 @@ def html(table: Table) -> str:
 
 
 _WORD = 18  # letters
+_BETWEEN, _EDGES = 2, 2  # letters that rich puts between two columns, and around all
 
 
-def for_terminal(table: Table) -> RichTable:
-    """For a rich console."""
+def for_terminal(table: Table, width: int) -> Group:
+    """For a rich console of so many letters, in parts below one another where its columns do not fit side by side.
+
+    Rich would cut off what does not fit: half a number is a wrong one.
+    """
+    texts = tuple(range(table.texts))
+    least = [_least_width(table, place) + _BETWEEN for place in range(len(table.columns))]
+    parts: list[tuple[int, ...]] = [texts]
+    for place in range(table.texts, len(table.columns)):
+        if parts[-1] != texts and _EDGES + sum(least[n] for n in (*parts[-1], place)) > width:
+            parts.append(texts)
+        parts[-1] = (*parts[-1], place)
+    shown = (_part(table, part, width, table.title if n == 0 else None) for n, part in enumerate(parts))
+    return Group(*shown, *([Text(table.note, style="italic dim")] if table.note else []))
+
+
+def _least_width(table: Table, place: int) -> int:
+    """Letters that a column needs so that no number and no name in it is broken or cut; intervals stay on one line."""
+    cells = [row[place] for row in table.rows]
+    words = [word for text in (table.columns[place], *cells) for word in text.split()]
+    whole = words if place < table.texts else [*words, *cells]
+    return min(max(map(len, whole), default=0), _WORD)
+
+
+def _part(table: Table, places: Sequence[int], width: int, title: str | None) -> RichTable:
+    """Some columns of a table.
+
+    Each column has what it needs, and as much more as it can use and there is. Rich would take from the widest alone.
+    """
     shown = RichTable(
-        title=escape_markup(table.title),
-        caption=escape_markup(table.note),
+        title=None if title is None else escape_markup(title),
         title_justify="left",
-        caption_justify="left",
         box=box.SIMPLE_HEAD,
         padding=(0, 1, 0, 0),
     )
-    for place, column in enumerate(table.columns):
+    least = {place: _least_width(table, place) for place in places}
+    left = max(0, width - _EDGES - sum(_BETWEEN + letters for letters in least.values()))
+    for place in places:
         side: Literal["left", "right"] = "left" if place < table.texts else "right"
-        words = [word for row in table.rows for word in row[place].split()]
-        longest = max(map(len, words), default=0)  # so that no number and no name is ever broken or cut
-        shown.add_column(escape_markup(column), justify=side, overflow="fold", min_width=min(longest, _WORD))
+        whole = max(len(cell) for cell in (table.columns[place], *(row[place] for row in table.rows)))
+        more = min(left, whole - least[place])
+        left -= more
+        shown.add_column(escape_markup(table.columns[place]), justify=side, overflow="fold", width=least[place] + more)
     for row in table.rows:
-        shown.add_row(*map(escape_markup, row), style="dim" if of_paper(row) else "")
+        shown.add_row(*(escape_markup(row[place]) for place in places), style="dim" if of_paper(row) else "")
     return shown
 
 

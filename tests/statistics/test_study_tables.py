@@ -3,6 +3,7 @@
 import io
 import math
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -206,20 +207,28 @@ def test_trials_tell_what_their_beads_leave_open() -> None:
 def test_cells() -> None:
     assert [number(v, 2) for v in (math.nan, math.inf, -1.0)] == ["–", "∞", "−1.00"]
     assert number(1.0, 1, "+") == "+1.0"
+    assert number(-0.001, 2) == "0.00"
     assert plus_minus(1, math.nan, 2) == "1.00"
     assert between((math.nan, math.nan), 2) == "–"
 
 
-def test_numbers_are_whole_in_a_terminal_of_80_columns() -> None:
-    console = Console(width=80, record=True, file=io.StringIO())
-    tables = group_tables(refuse(made_up(100, scale=0.1), [3, 4]), 0)
+@pytest.mark.parametrize("width", [60, 80, 120])
+@pytest.mark.parametrize("scale", [0.1, 1000.0])
+def test_numbers_are_whole_in_terminals_of_any_width(width: int, scale: float) -> None:
+    """Rich cuts off what does not fit, without a sign of it."""
+    console = Console(width=width, record=True, file=io.StringIO())
+    tables = group_tables(refuse(made_up(100, scale=scale), [3, 4]), 0)
     for table in tables:
-        console.print(for_terminal(table))
+        console.print(for_terminal(table, console.width))
     text = console.export_text()
     assert "…" not in text
-    words = set(text.split())
+    assert max(map(len, text.splitlines())) <= width
+    words = text.split()
     for table in tables:
-        assert {word for row in table.rows for cell in row[1:] for word in cell.split()} <= words
+        told = " ".join((table.title, table.note, *table.columns, *(cell for row in table.rows for cell in row[1:])))
+        assert set(told.split()) <= set(words)
+    cells = [word for table in tables for row in table.rows for cell in row[table.texts :] for word in cell.split()]
+    assert not Counter(cells) - Counter(words), "as often as the tables hold them"
 
 
 def test_files_html_and_terminal(tmp_path: Path) -> None:
@@ -227,5 +236,5 @@ def test_files_html_and_terminal(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["odd.csv", "odd.md", "odd.tex"]
     assert "5 % of a_b &amp; c" in html(ODD)
     console = Console(width=80, record=True, file=io.StringIO())
-    console.print(for_terminal(ODD))
+    console.print(for_terminal(ODD, console.width))
     assert "x_1 & y" in console.export_text()
