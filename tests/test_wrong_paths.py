@@ -213,6 +213,11 @@ def test_a_result_in_the_place_of_its_folder(tmp_path: Path) -> None:
         read_result(tmp_path / "result.json")
 
 
+def test_a_folder_without_a_result_is_told_how_one_is_made(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"result\.json: no such file\. .*`femoreg register CASE --out RUN`"):
+        read_result(tmp_path)
+
+
 @pytest.mark.parametrize(
     "words",
     [

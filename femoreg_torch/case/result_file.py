@@ -15,6 +15,7 @@ from femoreg_torch.case.trace import Moment, Restart, StageRecord, changes_conte
 from femoreg_torch.errors import InputError
 from femoreg_torch.files import read_json
 from femoreg_torch.geometry import CameraChange, Poses, poses_by_object
+from femoreg_torch.paths import check_readable
 
 RESULT_NAME = "result.json"
 SCHEMA = 2
@@ -96,6 +97,7 @@ def read_result(run: Path) -> Result:
     Raises `InputError` for a missing file, one that is no result, or a pose that is not rigid.
     """
     path = Path(run) / RESULT_NAME
+    check_readable(path, "Name a folder with a result: `femoreg register CASE --out RUN` makes one.")
     top = Fields(read_json(path), str(path))
     poses = _poses(top)
     names = tuple(poses.camera1_from)

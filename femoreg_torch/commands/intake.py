@@ -86,8 +86,10 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
 def _check_picture(out: Path, source: Path) -> None:
     """Raises `InputError` for a name that is none of a picture, or is that of what the picture is made of."""
     from femoreg_torch.errors import InputError
+    from femoreg_torch.files import check_files
     from femoreg_torch.text import MOST_YAML_BYTES, read_bytes
 
+    check_files(out)
     if out.suffix.lower() not in (".png", ".jpg"):
         raise InputError(f"{out}: a name that ends in .png was expected. Choose another with --out.")
     if not (out.exists() and source.exists()):

@@ -24,10 +24,12 @@ def replay(run: Path, *, case: Path | None = None, out: Path | None = None) -> N
 
     from femoreg_torch.case import read_case, read_result
     from femoreg_torch.evaluation import write_replay
+    from femoreg_torch.files import check_files
 
     console, result = Console(), read_result(run)
     folder = case_of(run, result, case)
     path = run / "replay.gif" if out is None else out
+    check_files(path)
     with console.status("drawing"):
         write_replay(path, read_case(folder), result)
     console.print(f"Replay written to {path}")

@@ -1,5 +1,6 @@
 """What commands say in the terminal."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -12,17 +13,27 @@ from femoreg_torch.case import Result
 from femoreg_torch.drr import DeviceName, chosen_device
 from femoreg_torch.drr.device import told, why_no_gpu
 
+_BETWEEN_LINES_S = 30.0  # of a log, which shows no bar
+
 
 @contextmanager
 def progress_report(console: Console, first: str) -> Iterator[Callable[[str, float], None]]:
-    """A bar that is told what is done and the share of the work behind it, from 0 to 1; none but in a terminal."""
+    """A bar that is told what is done and the share of the work behind it, from 0 to 1.
+
+    Where the output is no terminal but, say, a log, a line tells it instead, every half minute.
+    """
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     unseen = not console.is_interactive  # an empty line would be left of it
     with Progress(*columns, console=console, transient=True, disable=unseen) as progress:
         task = progress.add_task(first, total=1.0)
+        told = time.monotonic()
 
         def report(step: str, share: float) -> None:
+            nonlocal told
             progress.update(task, completed=share, description=step)
+            if unseen and time.monotonic() - told > _BETWEEN_LINES_S:
+                told = time.monotonic()
+                console.print(f"{share:.0%}: {step}", markup=False, highlight=False, soft_wrap=True)
 
         yield report
 

@@ -5,6 +5,7 @@ from pathlib import Path as File
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, StrMethodFormatter
 
 from femoreg_torch.files import temporary_file
@@ -74,8 +75,11 @@ def overlay_figure(prepared: Prepared, plan: FemoroplastyPlan) -> Figure:
         axis.set(xlabel=_AXES[across[0]], ylabel=_AXES[across[1]] if plane != "axial" else "P ←   → A")
         axis.set(xticks=[], yticks=[])
         corner = edges[0, across[0]] + 4, upwards[0] + (4 if plane != "axial" else -4)
-        axis.plot([corner[0], corner[0] + _BAR_MM], [corner[1], corner[1]], color="white", linewidth=3)
-        axis.annotate(f"{_BAR_MM:g} mm", corner, (0, 4), textcoords="offset points", color="white")
+        rim = [withStroke(linewidth=5, foreground="black")]  # cortex is as white as the bar
+        bar = [corner[0], corner[0] + _BAR_MM], [corner[1], corner[1]]
+        axis.plot(*bar, color="white", linewidth=3, path_effects=rim)
+        label = axis.annotate(f"{_BAR_MM:g} mm", corner, (0, 4), textcoords="offset points", color="white")
+        label.set_path_effects([withStroke(linewidth=3, foreground="black")])
     figure.suptitle(
         "cement as planned (filled; red: little of a voxel's pores, yellow: all), free optimum (blue), "
         "path (green, projected; dot: entry point)\n"

@@ -794,3 +794,12 @@ def test_how_near_a_bone_is_does_not_hang_on_the_voxels() -> None:
         assert found is not None
         assert found[1] == pytest.approx(10.5 if mm == 0.5 else 15.0, abs=mm)
         assert nearest_voxel(labels, [1], torch.tensor([0.0, 0.0, 60.0], dtype=torch.float64)) is None
+
+
+def test_a_picture_that_cannot_be_written_is_told_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "case").mkdir()
+    (tmp_path / "case" / "case.yaml").write_text("not: read\n", encoding="utf-8")
+    assert main(["check", str(tmp_path / "case"), "--out", str(tmp_path / "none" / "check.png")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
