@@ -29,9 +29,9 @@ from femoreg_torch.geometry import Camera, Poses, about_point, exp_se3, transfor
 from femoreg_torch.optimize import levenberg
 from femoreg_torch.registration import Scene, Stage, load_plan, prepare_scene
 from femoreg_torch.registration.compared import prepared
+from femoreg_torch.registration.costs import ImageCosts, image_costs
 from femoreg_torch.registration.imaging import draw, draw_still, tissue_integrals
 from femoreg_torch.registration.level import Level, binning
-from femoreg_torch.registration.objective import ImageCosts, image_costs
 from femoreg_torch.registration.scene import Body
 from femoreg_torch.registration.stage import run_stage
 from femoreg_torch.registration.step import chosen_kinds, chosen_objects

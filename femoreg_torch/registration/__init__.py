@@ -1,8 +1,9 @@
 """Registration: scene, objective, steps as data, the workflow that runs them, and the quality of its result."""
 
 from femoreg_torch.geometry import Poses
+from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import Imaging, Prior
+from femoreg_torch.registration.objective import Prior
 from femoreg_torch.registration.orbit import OrbitSearch
 from femoreg_torch.registration.plan import Plan, load_plan, plan_from
 from femoreg_torch.registration.prepare.scene import prepare_scene

@@ -12,8 +12,9 @@ from torch import Tensor
 from femoreg_torch.drr.reference import march
 from femoreg_torch.drr.sampling import middle_of, offsets_of
 from femoreg_torch.geometry import CArm, Poses, centred_camera, exp_se3
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body, RigidObject, Scene
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume, axis_aligned

@@ -27,11 +27,11 @@ from femoreg_torch.cores import on_all_cores
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import CArm, Poses, pose_difference, transform_points
 from femoreg_torch.optimize import parabola_minimum
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.evidence.covariance import PoseCovariance, pose_covariance
 from femoreg_torch.registration.evidence.turns import TOLD, losses_by_turning
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.roundness import Axis
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc

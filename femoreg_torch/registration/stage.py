@@ -13,11 +13,12 @@ from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
 from femoreg_torch.optimize import Optimiser
+from femoreg_torch.registration.costs import ImageCosts, image_costs
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, Intrinsics, doubted, refined
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.moments import moments_of
-from femoreg_torch.registration.objective import ImageCosts, Prior, image_costs, image_quadratic, stage_objective
+from femoreg_torch.registration.objective import Prior, image_quadratic, stage_objective
 from femoreg_torch.registration.restarts import restarts_of
 from femoreg_torch.registration.scene import Body, Kind, Moving, Scene, intrinsics_of, moved, reference_point_in_view
 from femoreg_torch.registration.step import (

@@ -12,8 +12,9 @@ from torch import Tensor
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.geometry import Poses, rotation_angle, transform_points
 from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.costs import ImageCosts, image_costs
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import ImageCosts, image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body, Kind, Scene, moved, reference_point_in_view
 from femoreg_torch.registration.step import Step, check_known, chosen_kinds, chosen_objects, lacking
 from femoreg_torch.settings import check_within

@@ -13,8 +13,9 @@ from registration_scenes import bone, float64
 from femoreg_torch.geometry import CArm, Poses, centred_camera, exp_so3, rigid
 from femoreg_torch.optimize import SmoothObjective
 from femoreg_torch.registration import Level, RigidObject, Scene
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.imaging import Imaging
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body
 from femoreg_torch.similarity import GradNcc
 

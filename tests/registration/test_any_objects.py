@@ -11,10 +11,10 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import invert_rigid, rigid
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, load_plan, run_plan
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.doubts.carm import doubts_about_the_views
 from femoreg_torch.registration.evidence.covariance import pose_covariance
 from femoreg_torch.registration.imaging import Imaging
-from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.stage import run_stage
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume, axis_aligned

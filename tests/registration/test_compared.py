@@ -10,9 +10,10 @@ from torch import Tensor
 from femoreg_torch.geometry import pose_difference
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.compared import veil_over
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.imaging import Imaging, draw, filled
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body, Scene, moved
 from femoreg_torch.similarity import GradNcc
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from femoreg_torch.cores import on_all_cores, shares
 from femoreg_torch.registration import Level
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.imaging import Imaging
-from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.scene import Body, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 

@@ -11,11 +11,12 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import CameraChange, Poses, Uncertainty, about_point, exp_se3, rigid
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.doubts.carm import doubts_about_the_carm
 from femoreg_torch.registration.evidence.covariance import pose_covariance
 from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, doubted, doubts
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, image_quadratic, stage_objective
+from femoreg_torch.registration.objective import image_quadratic, stage_objective
 from femoreg_torch.registration.quality import Limits, assess, assess_cameras, final_covariance
 from femoreg_torch.registration.run import notes_on_the_carm, notes_on_the_views
 from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, moved, reference_point_in_view

@@ -11,8 +11,8 @@ from femoreg_torch.drr import project
 from femoreg_torch.fluoro import binned
 from femoreg_torch.geometry import centred_camera, rigid
 from femoreg_torch.registration import Level
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.level import binning
-from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.scene import Body
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume, axis_aligned, voxelise_mesh

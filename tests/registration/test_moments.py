@@ -10,7 +10,7 @@ from femoreg_torch.case.trace import moments_content
 from femoreg_torch.files import plain
 from femoreg_torch.optimize import Bobyqa, CmaEs
 from femoreg_torch.registration import BodyPlan, Level, Stage
-from femoreg_torch.registration.objective import image_costs
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.stage import run_stage
 from femoreg_torch.similarity import GradNcc
 

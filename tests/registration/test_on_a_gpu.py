@@ -37,12 +37,13 @@ from femoreg_torch.drr import chosen_device
 from femoreg_torch.geometry import centred_camera, first_view_only
 from femoreg_torch.optimize import LevenbergMarquardt, SmoothObjective
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, run_plan
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.doubts.device import doubts_about_the_models
 from femoreg_torch.registration.evidence.handedness import handedness
 from femoreg_torch.registration.evidence.rigidity import bend, images_of
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.materials.calibration import Calibration
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.quality import Limits, assess, final_covariance
 from femoreg_torch.registration.scene import Body, Moving, Outline, intrinsics_of, reference_point_in_view
 from femoreg_torch.registration.stage import run_stage

@@ -11,6 +11,7 @@ from registration_scenes import CARM, REFERENCE_POINTS, VOLUMES, float64, make_s
 
 from femoreg_torch.geometry import centred_camera
 from femoreg_torch.registration import imaging as drawing
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.imaging import (
     PLAIN,
     Imaging,
@@ -24,7 +25,7 @@ from femoreg_torch.registration.imaging import (
     hardened_slope,
 )
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import Prior, image_costs, stage_objective
+from femoreg_torch.registration.objective import Prior, stage_objective
 from femoreg_torch.registration.scene import Body, reference_point_in_view
 from femoreg_torch.registration.weights import Weighting
 from femoreg_torch.similarity import GradNcc, Ncc, Similarity, derivative_taps, image_gradients

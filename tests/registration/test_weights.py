@@ -21,8 +21,9 @@ from femoreg_torch.drr import project
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Camera, pose_difference
 from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body, Scene, Segmentation, moved
 from femoreg_torch.registration.start.find import with_segmentations
 from femoreg_torch.registration.weights import Weighting, believed, pixel_weights

@@ -14,8 +14,9 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, first_view_only, rotation_angle, transform_points
 from femoreg_torch.optimize import Bobyqa, CmaEs, LevenbergMarquardt
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Prior, Scene, Stage, Step, run_plan
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.evidence.covariance import pose_covariance
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body, moved
 from femoreg_torch.registration.stage import run_stage
 from femoreg_torch.similarity import GradNcc

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.geometry import Poses
+from femoreg_torch.registration.costs import ImageCosts
 from femoreg_torch.registration.evidence.handedness import Handedness, handedness
 from femoreg_torch.registration.evidence.rigidity import CUTS, Bend, Turns, bend, gain_as_one, images_of
 from femoreg_torch.registration.imaging import Imaging
-from femoreg_torch.registration.objective import ImageCosts
 from femoreg_torch.registration.scene import Scene
 
 # Of the mean patch Grad-NCC. Seen on simulated procedures: mirror images fit worse by 0.01 to 0.06; where the CT was

@@ -21,9 +21,10 @@ from femoreg_torch.fluoro import natural
 from femoreg_torch.geometry import Camera, Poses, transform_points
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.compared import exposed_in_both
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.imaging import Imaging, draw
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body, Kind, Scene, moved, reference_point_in_view
 from femoreg_torch.registration.weights import dilated
 from femoreg_torch.similarity import GradNcc

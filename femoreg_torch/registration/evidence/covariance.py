@@ -32,6 +32,7 @@ from torch import Tensor
 from femoreg_torch.geometry import Poses
 from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.optimize import Quadratic
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.evidence.motion import (
     GuideDrift,
     JointTurn,
@@ -44,7 +45,7 @@ from femoreg_torch.registration.evidence.motion import (
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.intrinsics import Intrinsics, Profile, profile
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, mean_quadratic
+from femoreg_torch.registration.objective import mean_quadratic
 from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, reference_point_in_view
 from femoreg_torch.similarity import Similarity
 

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from femoreg_torch.geometry import Poses, transform_points
 from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.costs import ImageCosts, image_costs
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import ImageCosts, image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume, sharpened

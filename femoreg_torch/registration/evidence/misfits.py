@@ -13,9 +13,9 @@ from torch import Tensor
 
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.geometry import Camera, Poses
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.orbit import Draw, Drawn, OrbitSearch, drawn_from, search_orbit
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc

@@ -22,10 +22,11 @@ from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, log_so3, transform_points
 from femoreg_torch.geometry.rigid import skew
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective
+from femoreg_torch.registration.costs import ImageCosts, image_costs
 from femoreg_torch.registration.evidence.turns import TOLD, long_axis
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import ImageCosts, image_costs, image_quadratic, stage_objective
+from femoreg_torch.registration.objective import image_quadratic, stage_objective
 from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene, moved, shown_by
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume

@@ -15,9 +15,10 @@ from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
 from femoreg_torch.optimize import LevenbergMarquardt, parabola_minimum
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume

@@ -17,9 +17,9 @@ from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, project_points, transform_points
 from femoreg_torch.optimize import parabola_minimum
+from femoreg_torch.registration.costs import ImageCosts, image_costs
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level, binning
-from femoreg_torch.registration.objective import ImageCosts, image_costs
 from femoreg_torch.registration.scene import Body, Kind, Scene
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.geometry import Poses, transform_points
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs
 from femoreg_torch.registration.scene import Body, Scene, in_view
 from femoreg_torch.similarity import Similarity
 

@@ -9,9 +9,10 @@ from registration_scenes import REFERENCE_POINTS, make_scene, off, true_poses
 
 from femoreg_torch.geometry import Poses, log_so3
 from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.evidence.covariance import PoseCovariance, pose_covariance
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body, Scene, moved, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 

@@ -165,7 +165,7 @@ def test_soft_tissue_lies_about_the_bones_while_a_tip_is_asked(
         drawn_at.append(pose)
         return torch.zeros(camera.shape)
 
-    monkeypatch.setattr("femoreg_torch.registration.objective.tissue_integrals", tissue_integrals)
+    monkeypatch.setattr("femoreg_torch.registration.target.tissue_integrals", tissue_integrals)
     start = Start(TRUTH.camera1_from["pelvis"]) if given else Start()
     pelvis = replace(scene.objects["pelvis"], start=start)
     femur = replace(scene.objects["femur"], start=Start(beside="pelvis"))

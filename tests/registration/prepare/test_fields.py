@@ -16,8 +16,9 @@ from femoreg_torch.fluoro import Circle, Polygon, find_shutter, without_penumbra
 from femoreg_torch.geometry import Camera
 from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Scene, Stage
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.evidence.covariance import pose_covariance
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.prepare import images as reading_of_images
 from femoreg_torch.registration.prepare.images import read_images
 from femoreg_torch.registration.quality import Limits, assess

@@ -13,9 +13,10 @@ from femoreg_torch.evaluation import ReferencePoints, errors, path_displacements
 from femoreg_torch.fluoro.display import Source
 from femoreg_torch.geometry import Camera, CArm, Poses, about_point, centred_camera, exp_se3, rigid, transform_points
 from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_costs, stage_objective
+from femoreg_torch.registration.objective import stage_objective
 from femoreg_torch.registration.scene import Body, RigidObject, Scene, moved
 from femoreg_torch.similarity import Ncc
 from femoreg_torch.statistics.quantities import QUANTITIES
