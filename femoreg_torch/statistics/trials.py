@@ -73,9 +73,9 @@ def trial_table(rows: pd.DataFrame) -> Table:
     stars = [" *" if doubtful else "" for doubtful in rows["status"].eq(DONE) & ~rows["trusted"]]
     head = [name + star for name, star in zip(trials, stars, strict=True)] + [""] * (columns - len(trials))
     note = (
-        f"{len(trials)} trial{'s' * (len(trials) != 1)}; – where one gave no error, which mean and deviation then do not hold. Beads alone: "
-        "root mean square of what the beads leave open. *: the registration does not trust itself. The paper's six "
-        "trials were made on another specimen."
+        f"{len(trials)} trial{'s' * (len(trials) != 1)}; – where one gave no error, which mean and deviation then do "
+        "not hold. Beads alone: root mean square of what the beads leave open. *: the registration does not trust "
+        "itself. The paper's six trials were made on another specimen."
     )
     return Table("trials", "Trials", note, ("", "mean ± SD", *head), tuple(lines), pd.DataFrame(data))
 
