@@ -1,4 +1,4 @@
-"""Pictures into files, by OpenCV; what fails is told by the system, and nothing is printed beside."""
+"""Pictures into files, and words onto pictures, by OpenCV."""
 
 from pathlib import Path
 
@@ -9,6 +9,15 @@ import numpy as np
 def write_picture(path: Path, picture: np.ndarray) -> None:
     """Write a picture, grey (H, W) or blue, green, red (H, W, 3), in the format of the name's suffix.
 
-    It is encoded in memory: `cv2.imwrite` does not say why it failed, and libpng prints that it did. Raises `OSError`.
+    It is encoded in memory: `cv2.imwrite` does not say why it failed, and libpng prints that it did. Raises `OSError`,
+    which tells why.
     """
     path.write_bytes(cv2.imencode(path.suffix, picture)[1].tobytes())
+
+
+def put_words(
+    picture: np.ndarray, words: str, place: tuple[int, int], size: float, colour: tuple[int, int, int], line: int = 1
+) -> None:
+    """Write words onto a picture from a place (column, row) on, with a dark rim: they are read on white as well."""
+    for ink, wide in (((0, 0, 0), line + 2), (colour, line)):
+        cv2.putText(picture, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, ink, wide, cv2.LINE_AA)

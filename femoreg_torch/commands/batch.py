@@ -10,6 +10,8 @@ if TYPE_CHECKING:
 
     from femoreg_torch.case import Result
 
+_NO_RESULT = ("refused", "failed")
+
 
 @dataclass(frozen=True)
 class Job:
@@ -86,13 +88,16 @@ def batch(
         report(f"{len(left)} cases", 0)
         for done, (job, row) in enumerate(run_jobs(left, jobs), 1):
             rows[job.case] = row
-            report(f"{done} of {len(left)}: {row.case} {row.status}", done / len(left))
+            told = f"{done} of {len(left)}: {row.case} {row.status}"
+            report(told, done / len(left))
+            if not console.is_interactive:  # a log shows no bar
+                console.print(told, markup=False, highlight=False, soft_wrap=True)
             _write_table([rows[job.case] for job in waiting if job.case in rows], out / "table.csv")
         table = [rows[job.case] for job in waiting]
         _write_table(table, out / "table.csv")
     _tell(console, table)
     console.print(f"Table written to {out / 'table.csv'}.", markup=False)
-    if any(row.status in ("refused", "failed") for row in table):
+    if any(row.status in _NO_RESULT for row in table):
         return BAD_INPUT
     return NOT_TRUSTED if require_trust and not all(row.trusted for row in table) else DONE
 
@@ -258,7 +263,7 @@ def _write_table(rows: Sequence[Row], path: Path) -> None:
         writer.writerow(["case", "status", "trusted", "seconds", *names, "reasons"])
         for row in rows:
             errors = [f"{row.errors[name]:.4f}" if name in row.errors else "" for name in names]
-            trusted = "" if row.status in ("refused", "failed") else str(row.trusted).lower()
+            trusted = "" if row.status in _NO_RESULT else str(row.trusted).lower()
             writer.writerow([row.case, row.status, trusted, f"{row.seconds:.1f}", *errors, row.reasons])
 
 
@@ -266,8 +271,8 @@ def _tell(console: "Console", rows: Sequence[Row]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table("case", "", "trusted", "s", "why not")
+    table = Table("case", "run", "trusted", "s", "why not")
     for row in rows:
-        trusted = "[green]yes[/]" if row.trusted else "[bold red]no[/]"
+        trusted = "[green]yes[/]" if row.trusted else "–" if row.status in _NO_RESULT else "[bold red]no[/]"
         table.add_row(escape(row.case), row.status, trusted, f"{row.seconds:.0f}", escape(row.reasons))
     console.print(table)

@@ -25,7 +25,7 @@ def beads(case: Path, *, beads: Path, out: Path, run: Path | None = None) -> Non
     from rich.markup import escape
 
     from femoreg_torch.beads import measure, read_beads, uncertainty_content, write_measured
-    from femoreg_torch.case import case_folder, read_case, read_result
+    from femoreg_torch.case import RESULT_NAME, case_folder, read_case, read_result
     from femoreg_torch.evaluation.fit import check_fits
     from femoreg_torch.files import check_new_folder
 
@@ -60,6 +60,8 @@ def beads(case: Path, *, beads: Path, out: Path, run: Path | None = None) -> Non
     if deviations:
         console.print("These hold for a C-arm that is as its file says: a wrong source distance is not in them.")
     console.print(f"The case without beads, and its truth: {escape(str(out))}")
+    for earlier in sorted(out.glob(f"*/{RESULT_NAME}")):
+        console.print(f"[yellow]{escape(str(earlier.parent))} is of the case that was here before:[/] register again.")
 
 
 def beads_table(trials: Path, *, run: str = "run") -> None:

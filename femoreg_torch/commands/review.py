@@ -7,6 +7,8 @@ if TYPE_CHECKING:
     from femoreg_torch.review import Order
     from femoreg_torch.review.running import Follow, Report
 
+_LAST_PORT = 65535
+
 
 def review(
     folder: Path,
@@ -35,7 +37,7 @@ def review(
         seed: Of the random searches.
         weights: Weights of the landmark network, if not those shipped (safetensors).
         device: Where registrations compute: cpu, cuda (the first GPU), or auto, a GPU where there is one.
-        port: Port of 127.0.0.1 to listen on; by default a free one.
+        port: Port of 127.0.0.1 to listen on, up to 65535; 0 takes a free one.
     """
     import secrets
     import socket
@@ -49,6 +51,8 @@ def review(
     from femoreg_torch.registration import load_plan, prepare_scene
     from femoreg_torch.review import LOOPBACK, Desk, Order, only_review, review_app, serve
 
+    if not 0 <= port <= _LAST_PORT:
+        raise InputError(f"--port: 0 to {_LAST_PORT} was expected, found {port}.")
     console = Console()
     of, run = _case_and_run(folder, case, out)
     place = tell_device(console, device)
@@ -62,6 +66,8 @@ def review(
             raise InputError(
                 f"--port {port}: cannot listen there ({error}). Leave it out to take a free one."
             ) from error
+        if not console.is_interactive:
+            console.print("Reading the case; the address comes next.")
         with console.status("reading the case"):
             read = read_case(of)
             desk = Desk(read, prepare_scene(read), Order(of, run, preset, seed, str(place), weights), register_order)

@@ -81,7 +81,8 @@ def segment(
         console.print(f"  {escape(note)}", highlight=False)
     for bone, volume_ml in found.volume_ml.items():
         sure = f", mean probability {found.confidence[bone]:.2f}" if bone in found.confidence else ""
-        console.print(f"  {bone}: {volume_ml:.0f} ml{sure}", highlight=False)
+        digits = 0 if volume_ml >= 1 else 2
+        console.print(f"  {bone}: {volume_ml:.{digits}f} ml{sure}", highlight=False)
     for warning in found.warnings:
         tell(console, "Warning", warning)
     console.print(
@@ -127,7 +128,7 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str | None = None, se
     console = Console(soft_wrap=True)
     volume, told = read_ct_told(ct, series)
     table, parts = table_of_map(labels, bones, usual="femoreg")
-    found_labels, more = read_labels_told(labels, volume, {n for ids in table.values() for n in ids})
+    found_labels, done, against = read_labels_told(labels, volume, {n for ids in table.values() for n in ids})
     known = bone_labels(found_labels, volume, table, HIP, {})
     with console.status("looking for landmarks"):
         found = propose_landmarks(volume, known)
@@ -140,7 +141,7 @@ def landmarks(ct: Path, labels: Path, *, out: Path, bones: str | None = None, se
             f"table. Say which: --bones {', '.join(label_table_names())}, or a YAML file."
         )
     write_landmarks(out, found.points)
-    for note in (*told, *parts, *more):
+    for note in (*told, *parts, *done, *against):
         console.print(f"  {escape(note)}", highlight=False)
     for name, error in found.expected_error_mm.items():
         console.print(f"  {name}: expected error {error:.1f} mm", highlight=False)

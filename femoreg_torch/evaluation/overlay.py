@@ -14,6 +14,7 @@ from femoreg_torch.drr import project
 from femoreg_torch.evaluation.colours import GUIDE, PATH, Colour, object_colours
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
+from femoreg_torch.pictures import put_words
 from femoreg_torch.registration import Scene
 from femoreg_torch.registration.scene import Kind
 
@@ -197,7 +198,7 @@ def _draw_landmarks(picture: Picture, case: Case, scene: Scene, poses: Poses, vi
         place = (round(column), round(row))
         cv2.drawMarker(picture, place, _LANDMARK, cv2.MARKER_CROSS, 9, 1, cv2.LINE_AA)
         beside = (place[0] + 5, place[1] - 4)
-        cv2.putText(picture, name, beside, cv2.FONT_HERSHEY_SIMPLEX, 0.35, _LANDMARK, 1, cv2.LINE_AA)
+        put_words(picture, name, beside, 0.4, _LANDMARK)
 
 
 def small_field(scene: Scene, kind: Kind, view: int, factor: int) -> Tensor | None:

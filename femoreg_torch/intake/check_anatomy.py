@@ -99,8 +99,8 @@ def check_bones(
 ) -> BoneLabels:
     """The bones of a label map on the grid of a CT, HU, and what contradicts that, for `found`. Raises `InputError`."""
     wanted = {n for ids in table.values() for n in ids}
-    labels, told = read_labels_told(path, ct, wanted)
-    found.warnings += [*told, *(f"{path.name}: {warning}" for warning in header_warnings(path))]
+    labels, done, against = read_labels_told(path, ct, wanted)
+    found.warnings += [*done, *against, *(f"{path.name}: {warning}" for warning in header_warnings(path))]
     bones = bone_labels(labels, ct, table, anatomy, marks)
     seen = densities(ct, bones.labels)
     if seen.unscaled is not None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.anatomy import HIP, bone_of_name, fitting_tables
-from femoreg_torch.case import read_case
+from femoreg_torch.case import RESULT_NAME, read_case, read_result
 from femoreg_torch.case.models import BODIES_SUFFIXES
 from femoreg_torch.case.reading import CASE_NAME
 from femoreg_torch.errors import InputError
@@ -47,6 +47,8 @@ _MESHES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb", ".step", ".stp")
 _POINTS = (".fcsv", ".json", ".csv", ".tsv")
 _TRANSFORMS = (".tfm", ".h5", ".mat")
 _PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+_BESIDE_A_RESULT = ("errors.json", "navigation.json", "overlay.png", "replay.gif", "report.html", "review.json")
+_TRUTH_NAME = "truth.json"
 _LISTED = 40  # entries of a folder
 _ALONE = (SEGMENTATION_SUFFIX, ".mrk.json", ".fcsv", *_MESHES, *_TRANSFORMS)  # not found among masks of bones
 _TINTS = (
@@ -78,6 +80,14 @@ def inspect_path(path: Path, series: str | None = None) -> Findings:
         return _folder(path, series)
     if path.name == CASE_NAME:
         return _case(path)
+    if path.name == RESULT_NAME:
+        return _run(path.parent)
+    if path.name in _BESIDE_A_RESULT and (path.parent / RESULT_NAME).is_file():
+        return Findings(f"part of the result in {path.parent}", ("`femoreg inspect` of the folder tells more",))
+    if path.name == _TRUTH_NAME and (path.parent / CASE_NAME).is_file():
+        return Findings(
+            f"known poses of the case in {path.parent}", ("`femoreg evaluate` compares a result with them",)
+        )
     name = path.name.lower()
     kinds: tuple[tuple[tuple[str, ...], Callable[[Path], Findings]], ...] = (
         ((SEGMENTATION_SUFFIX,), _segmentation),
@@ -101,6 +111,8 @@ def _folder(path: Path, series: str | None) -> Findings:
     kind = _kind_of(path)
     if kind == "case":
         return _case(path)
+    if kind == "result":
+        return _run(path)
     if kind == "masks of bones":
         return _segmentation(path)
     if kind in ("several things", "images"):
@@ -139,6 +151,8 @@ def _kind_of(folder: Path) -> str:
     """What a folder is, by the names in it."""
     if (folder / CASE_NAME).is_file():
         return "case"
+    if (folder / RESULT_NAME).is_file():
+        return "result"
     names = [entry.name.lower() for entry in _entries(folder)]
     if any(name.endswith(_ALONE) for name in names):
         return "several things"
@@ -163,7 +177,7 @@ def _in_short(entry: Path) -> str:
             told = "; ".join(one.told for one in series_in(entry))
             nothing = "more folders" if any(inner.is_dir() for inner in _entries(entry)) else "nothing known here"
             return f"{entry.name}: folder, {told or nothing}"
-        return f"{entry.name}: {'' if kind == 'case' else 'folder of '}{kind}"
+        return f"{entry.name}: {'folder of ' if kind.endswith('s') else ''}{kind}"
     try:
         found = inspect_path(entry)
     except InputError as error:
@@ -339,3 +353,14 @@ def _case(path: Path) -> Findings:
         "`femoreg check` lists what is wrong with it",
     ]
     return Findings("case", tuple(facts))
+
+
+def _run(folder: Path) -> Findings:
+    result = read_result(folder)
+    facts = [
+        f"objects: {', '.join(result.poses.camera1_from)}; {len(result.poses.camera_from_camera1)} views",
+        f"preset {result.preset}, seed {result.seed}" + ("" if result.case is None else f", of the case {result.case}"),
+        result.verdict.sentence if result.verdict.trusted else "not trusted",
+        "`femoreg evaluate`, `replay`, `navigate`, `review` and `slicer` go on from it",
+    ]
+    return Findings("result of a registration", tuple(facts), () if result.verdict.trusted else result.verdict.reasons)

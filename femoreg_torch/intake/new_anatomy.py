@@ -58,10 +58,10 @@ def told_bones(bones: LabelTable) -> str | dict[str, list[int]]:
 def placed_labels(folder: Path, path: Path, ct: Volume, bones: LabelTable, notes: list[str]) -> tuple[str, Volume]:
     """The name of the label map in `folder`, and the map on the grid of the CT."""
     ids = {n for of_bone in bones.values() for n in of_bone}
-    labels, told = read_labels_told(path, ct, ids)
+    labels, done, against = read_labels_told(path, ct, ids)
     if path.is_file() and path.name.lower().endswith(_COPIED):
         return copied(path, folder, "labels"), labels  # what was done is done again, and told, whenever it is read
-    notes += told
+    notes += [*done, *against]
     write_volume(folder / "labels.nii.gz", labels)
     return "labels.nii.gz", labels
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from femoreg_torch.geometry import transform_points
+from femoreg_torch.pictures import put_words
 from femoreg_torch.volume import Volume, crop, resample_isotropic
 
 Picture = NDArray[np.uint8]  # (H, W, 3), blue, green, red
@@ -22,7 +23,6 @@ _CELL_PX, _COLUMNS = 300, 3  # of images side by side
 _ENDS_PERCENT = (0.5, 99.5)  # of the pixels, that set the window of an image
 _TINT = 0.35
 _WHITE, _YELLOW = (255, 255, 255), (60, 230, 255)
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def three_planes(
@@ -60,7 +60,7 @@ def three_planes(
             row = (where[down] + 0.5) * volume.spacing_mm[down] / spacing
             row = size[1] - row if down == 2 else row
             cv2.drawMarker(panel, (round(column), round(row)), _YELLOW, cv2.MARKER_CROSS, 8, 1, cv2.LINE_AA)
-            cv2.putText(panel, mark, (round(column) + 5, round(row) - 4), _FONT, 0.35, _YELLOW, 1, cv2.LINE_AA)
+            put_words(panel, mark, (round(column) + 5, round(row) - 4), 0.35, _YELLOW)
         left, right = ("front", "back") if axis == 0 else ("R", "L")
         panels.append(_captioned(panel, f"{caption}{name}", left, right))
     height = max(panel.shape[0] for panel in panels)
@@ -127,8 +127,7 @@ def _cell(name: str, image: Tensor) -> Picture:
     small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
     cell = np.zeros((_CELL_PX, _CELL_PX, 3), np.uint8)
     cell[: small.shape[0], : small.shape[1]] = small[..., None]
-    for colour, line in (((0, 0, 0), 4), (_YELLOW, 1)):  # seen on any background
-        cv2.putText(cell, name, (6, 18), _FONT, 0.45, colour, line, cv2.LINE_AA)
+    put_words(cell, name, (6, 18), 0.45, _YELLOW)
     return cell
 
 
@@ -171,7 +170,7 @@ def _window(grey: Volume) -> tuple[float, float]:
 
 def _captioned(panel: Picture, name: str, left: str, right: str) -> Picture:
     width = panel.shape[1]
-    cv2.putText(panel, left, (6, 18), _FONT, 0.5, _WHITE, 1, cv2.LINE_AA)
-    cv2.putText(panel, right, (width - 10 * len(right) - 8, 18), _FONT, 0.5, _WHITE, 1, cv2.LINE_AA)
-    cv2.putText(panel, name, (6, panel.shape[0] - 8), _FONT, 0.45, _WHITE, 1, cv2.LINE_AA)
+    put_words(panel, left, (6, 18), 0.5, _WHITE)
+    put_words(panel, right, (width - 10 * len(right) - 8, 18), 0.5, _WHITE)
+    put_words(panel, name, (6, panel.shape[0] - 8), 0.45, _WHITE)
     return panel

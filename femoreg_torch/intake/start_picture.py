@@ -16,6 +16,7 @@ from femoreg_torch.evaluation.overlay import monitor_picture, paint_edges, small
 from femoreg_torch.fluoro import downsample
 from femoreg_torch.geometry import Camera, Poses, project_points, transform_points
 from femoreg_torch.intake.planes import Picture
+from femoreg_torch.pictures import put_words
 from femoreg_torch.registration import Scene, load_plan, prepare_scene
 from femoreg_torch.registration.doubts.plan import doubts_about_the_guide, doubts_about_the_plan
 from femoreg_torch.registration.run import network_detector
@@ -25,7 +26,6 @@ from femoreg_torch.registration.start.find import look_at
 
 _WIDTH_PX = 560
 _PRESET = "fast"  # whose steps look for view 1 from another view, where it shows too little
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
 _LEAST_SHOWN = 0.25  # of a model: with less, a device may be seen by its round guide alone
 _YELLOW, _MAGENTA, _WHITE = (60, 230, 255), (255, 60, 255), (255, 255, 255)
 
@@ -122,7 +122,7 @@ def _panel(case: Case, scene: Scene, poses: Poses, kind: str) -> Picture:
         pose = poses.camera_from(name)[0]
         drawn = project([scene.objects[name].volume], pose[None, None], camera)[0]
         paint_edges(panel, drawn, colours[name])
-        _write(panel, camera, pose, scene.objects[name].reference_point, name, colours[name][::-1])
+        _write(panel, camera, pose, scene.objects[name].reference_point, name, colours[name][::-1], below=14)
     if scene.anchor in poses.camera1_from:
         camera_from_ct = poses.camera_from(scene.anchor)[0]
         for mark, point in case.landmarks.items():
@@ -132,7 +132,7 @@ def _panel(case: Case, scene: Scene, poses: Poses, kind: str) -> Picture:
         start, end = project_points(camera, transform_points(poses.camera_from(case.plan.object)[0], ends)).tolist()
         corners = [(round(column), round(row)) for column, row in (start, end)]
         cv2.line(panel, corners[0], corners[1], _MAGENTA, 1, cv2.LINE_AA)
-    cv2.putText(panel, f"view 1, {kind}", (6, panel.shape[0] - 8), _FONT, 0.45, _WHITE, 1, cv2.LINE_AA)
+    put_words(panel, f"view 1, {kind}", (6, panel.shape[0] - 8), 0.45, _WHITE)
     _write_sides(panel, case, scene, poses)
     return panel
 
@@ -144,15 +144,21 @@ def _write_sides(panel: Picture, case: Case, scene: Scene, poses: Poses) -> None
     to_left = float(poses.camera_from(scene.anchor)[0][0, 0])
     names = ("L", "R") if to_left < 0 else ("R", "L")
     for name, column in zip(names, (8, panel.shape[1] - 22), strict=True):
-        for colour, width in (((0, 0, 0), 5), (_WHITE, 2)):  # a white letter is seen on a white background, too
-            cv2.putText(panel, name, (column, 24), _FONT, 0.7, colour, width, cv2.LINE_AA)
+        put_words(panel, name, (column, 24), 0.7, _WHITE, 2)
 
 
 def _write(
-    panel: Picture, camera: Camera, camera_from_object: Tensor, point: Tensor, text: str, colour: tuple[int, int, int]
+    panel: Picture,
+    camera: Camera,
+    camera_from_object: Tensor,
+    point: Tensor,
+    text: str,
+    colour: tuple[int, int, int],
+    below: int = -4,
 ) -> None:
+    """A cross at a point (3,) of an object, and `text` beside it, so many pixels `below`."""
     column, row = project_points(camera, transform_points(camera_from_object, point[None]))[0].tolist()
     if 0 <= column < camera.shape[1] and 0 <= row < camera.shape[0]:
         place = (round(column), round(row))
         cv2.drawMarker(panel, place, colour, cv2.MARKER_CROSS, 7, 1, cv2.LINE_AA)
-        cv2.putText(panel, text, (place[0] + 5, place[1] - 4), _FONT, 0.38, colour, 1, cv2.LINE_AA)
+        put_words(panel, text, (place[0] + 5, place[1] + below), 0.38, colour)

@@ -32,6 +32,7 @@ class BoneLabels:
     ids: dict[str, int]  # of every bone that occurs in it, or of a group of bones that it does not tell apart
     absent: LabelTable = field(default_factory=dict)  # what the user's table names, and no voxel carries
     notes: tuple[str, ...] = ()  # what had to be done to CT and label map, in words
+    against: tuple[str, ...] = ()  # what speaks against where the label map lies, in words
 
     def of(self, bones: Sequence[str], anatomy: Anatomy | None) -> tuple[int, ...]:
         """Ids of bones and groups. Raises `InputError` for a bone that the map does not tell."""

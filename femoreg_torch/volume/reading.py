@@ -3,6 +3,7 @@
 import errno
 from collections.abc import Collection
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import SimpleITK as sitk
@@ -146,11 +147,19 @@ def _label_map_told(path: Path, ids: Collection[int] | None) -> tuple[Volume, tu
 
 def read_labels(path: Path, like: Volume) -> Volume:
     """A label map (`read_label_map`) on the grid of `like`, by nearest neighbour if its own is another."""
-    return read_labels_told(path, like)[0]
+    return read_labels_told(path, like).labels
 
 
-def read_labels_told(path: Path, like: Volume, ids: Collection[int] | None = None) -> tuple[Volume, tuple[str, ...]]:
-    """A label map on the grid of `like`, and what had to be done to it in words.
+class LabelsTold(NamedTuple):
+    """A label map on the grid of a CT, and what is told of it in words."""
+
+    labels: Volume
+    done: tuple[str, ...]  # what had to be done to it
+    against: tuple[str, ...]  # what speaks against where it lies
+
+
+def read_labels_told(path: Path, like: Volume, ids: Collection[int] | None = None) -> LabelsTold:
+    """A label map on the grid of `like`, the CT.
 
     A map on another grid is resampled by nearest neighbour. Of a segmentation whose parts have names, only those with
     the values `ids` are read; None: all. Raises `InputError` as `read_label_map` does, and for a map that is empty,
@@ -159,14 +168,17 @@ def read_labels_told(path: Path, like: Volume, ids: Collection[int] | None = Non
     labels, told = _label_map_told(Path(path), ids)
     if not labels.data.any():
         raise InputError(f"{path}: the label map is empty: no voxel has a label. Export it anew.")
+    against: tuple[str, ...] = ()
     if labels.data.shape == like.data.shape:
-        corners = torch.cartesian_prod(
-            *(torch.tensor([0.0, n - 1], dtype=torch.float64) for n in like.data.shape[::-1])
-        )
+        near = 0.05 * min(like.spacing_mm)
         shift = labels.lps_from_index - like.lps_from_index
-        apart = (corners @ shift[:3, :3].T + shift[:3, 3]).norm(dim=1).max().item()
-        if apart <= 0.05 * min(like.spacing_mm):
-            return Volume(labels.data, like.lps_from_index), told
+        beside = shift[:3, 3]
+        corners = torch.cartesian_prod(*(beside.new_tensor([0.0, n - 1]) for n in like.data.shape[::-1]))
+        turned = corners @ shift[:3, :3].T
+        if (turned + beside).norm(dim=1).max() <= near:
+            return LabelsTold(Volume(labels.data, like.lps_from_index), told, ())
+        if turned.norm(dim=1).max() <= near:
+            against = (_origin_doubted(Path(path), beside, like),)
     grid = sitk.Resample(_image(labels), _image(like), sitk.Transform(), sitk.sitkNearestNeighbor, 0)
     moved = Volume(torch.from_numpy(sitk.GetArrayFromImage(grid)), like.lps_from_index)
     labelled = int(labels.data.count_nonzero()) * float(np.prod(labels.spacing_mm))
@@ -180,7 +192,26 @@ def read_labels_told(path: Path, like: Volume, ids: Collection[int] | None = Non
     note = f"the label map {path.name} has a grid of its own ({spacing} mm): it was resampled by nearest neighbour"
     if kept < _LEAST_INSIDE * labelled:
         note += f", and {1 - kept / labelled:.0%} of what it labels lies outside the CT"
-    return moved, (*told, note)
+    return LabelsTold(moved, (*told, note), against)
+
+
+def _origin_doubted(path: Path, beside: Tensor, like: Volume) -> str:
+    """That a label map has the voxels of its CT, but not its origin: it lies `beside` (3,) mm LPS.
+
+    Of the steps that programs confuse, half a voxel along every axis is one: an origin is the middle of the first
+    voxel, and some take it for its corner.
+    """
+    voxels = torch.linalg.solve(like.lps_from_index[:3, :3], beside).abs()
+    half = " (half a voxel along each axis: was the origin taken for a corner?)" if _is_half(voxels) else ""
+    by = ", ".join(f"{mm + 0.0:.2f}" for mm in beside.tolist())
+    return (
+        f"the label map {path.name} has as many voxels as the CT, as large and along the same axes, but lies ({by}) mm "
+        f"LPS beside it{half}: if it was drawn on this CT, give it the CT's origin, for one of both headers is wrong"
+    )
+
+
+def _is_half(voxels: Tensor) -> bool:
+    return bool(((voxels - 0.5).abs() < 0.05).all())
 
 
 def write_volume(path: Path, volume: Volume) -> None:

@@ -109,7 +109,7 @@ def read_patient(files: PatientFiles) -> ScannedPatient:
     """
     ct, told_of_ct = read_ct_told(files.ct)
     asked = {n for ids in files.table.values() for n in ids} if files.in_case else None
-    labels, told_of_labels = read_labels_told(files.labels, ct, asked)
+    labels, done, against = read_labels_told(files.labels, ct, asked)
     found = [n for n in torch.bincount(labels.data.flatten()).nonzero()[:, 0].tolist() if n]
     if not files.in_case:
         _check_ids(files, found)
@@ -124,7 +124,7 @@ def read_patient(files: PatientFiles) -> ScannedPatient:
         )
     if wrong := swapped_sides(bones, files.landmarks, HIP) or merged_bones(bones, files.landmarks, HIP):
         raise InputError(f"{files.folder}: {'; '.join(wrong)}.")
-    notes = (*told_of_ct, *told_of_labels, *_without_name(bones))
+    notes = (*told_of_ct, *done, *against, *_without_name(bones))
     return ScannedPatient(ct, replace(bones, notes=notes), files.landmarks)
 
 

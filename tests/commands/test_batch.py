@@ -68,6 +68,13 @@ def test_what_a_killed_run_left_of_a_case_that_is_kept_is_removed(
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["table.csv"]
 
 
+def test_a_log_tells_every_case_as_it_ends(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert main(["batch", str(tmp_path / "none"), "--out", str(tmp_path / "runs")]) == 2
+    told = capfd.readouterr().out.splitlines()
+    assert told[0] == "1 of 1: none refused"
+    assert any("refused" in line and "–" in line for line in told[1:])
+
+
 def text_as_weights(root: Path) -> Path:
     path = root / "weights.safetensors"
     path.write_text("no weights", encoding="utf-8")

@@ -315,9 +315,14 @@ def test_the_registration_refuses_swapped_sides_and_tells_what_was_done_to_a_lab
     shutil.copytree(files, folder)
     write_content(folder, case_content())
     image = nibabel.load(folder / "labels.nii.gz")
+    labels = np.asarray(image.dataobj)
     nibabel.save(image.slicer[2:, :, 1:], folder / "labels.nii.gz")
     notes = prepare_scene(read_case(folder)).missing
     assert any("labels.nii.gz has a grid of its own (4 × 4 × 4 mm): it was resampled" in note for note in notes)
+    moved = image.affine.copy()
+    moved[:3, 3] += 2
+    nibabel.save(nibabel.Nifti1Image(labels, moved), folder / "labels.nii.gz")
+    assert any("was the origin taken for a corner?" in one for one in prepare_scene(read_case(folder)).contradictions)
     swapped({}, folder)
     with pytest.raises(InputError, match="landmarks: left and right are swapped"):
         prepare_scene(read_case(folder))

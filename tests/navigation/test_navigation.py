@@ -16,6 +16,7 @@ from femoreg_torch.case import Result, read_result
 from femoreg_torch.commands.main import main
 from femoreg_torch.files import read_json, write_json
 from femoreg_torch.geometry import poses_by_object
+from femoreg_torch.intake import inspect_path
 from femoreg_torch.navigation import navigation_content, read_robot, summary
 
 Matrix = NDArray[np.float64]
@@ -412,3 +413,16 @@ def test_reasons_that_stand_above_are_not_told_twice(tmp_path: Path) -> None:
     assert reason in summary(content)[0]
     assert summary(content, [reason])[0].endswith("Do not steer by this, it is not trusted[/].")
     assert summary(content, [reason])[1:] == summary(content)[1:]
+
+
+@pytest.mark.parametrize("trusted", [True, False])
+def test_inspect_tells_what_a_result_is(trusted: bool, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", trusted)
+    (run / "overlay.png").write_bytes(b"a picture in colour")
+    for path in (run, run / "result.json"):
+        found = inspect_path(path)
+        assert found.kind == "result of a registration"
+        assert "objects: pelvis, femur, device; 3 views" in found.facts
+        assert bool(found.warnings) != trusted
+    assert inspect_path(run / "overlay.png").kind == f"part of the result in {run}"
+    assert inspect_path(tmp_path).facts == ("run: result",)

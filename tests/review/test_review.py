@@ -306,3 +306,8 @@ def test_a_new_result_removes_the_scene_of_the_one_before(run: Path, order: Orde
     register_into(run, read_case(order.case), order.preset, 0, start=start)
     assert not (run / "slicer").exists()
     assert (run / "notes.txt").exists()
+
+
+def test_a_port_that_is_none_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["review", str(tmp_path), "--port", "99999"]) == 2
+    assert capsys.readouterr().err == "femoreg: --port: 0 to 65535 was expected, found 99999.\n"

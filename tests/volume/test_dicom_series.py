@@ -359,7 +359,7 @@ def test_dicom_segmentations(tmp_path: Path, kind: str) -> None:
     seg.save_as(path)
     assert segment_names(path) == {"Left femur": (1,), "Left hip": (2,)}
     ct = read_volume(tmp_path / "ct")
-    labels, told = read_labels_told(path, ct)
+    labels, told, _ = read_labels_told(path, ct)
     expected = np.where(masks[..., 0] > 0, 1, 2 * masks[..., 1])
     np.testing.assert_array_equal(sampled(labels, points_of(OBLIQUE, NO_LEAN)), expected)
     assert any("lie in both Left femur and Left hip" in line for line in told) == shared

@@ -437,7 +437,7 @@ def test_a_label_map_on_another_grid_is_resampled_by_nearest_neighbour(tmp_path:
         labels.SetDirection((Rotation.from_euler("z", 30, degrees=True).as_matrix() @ OBLIQUE).ravel().tolist())
     sitk.WriteImage(labels, str(tmp_path / "labels.nrrd"))
     ct = read_ct(tmp_path / "ct.nii.gz")
-    found, told = read_labels_told(tmp_path / "labels.nrrd", ct)
+    found, told, _ = read_labels_told(tmp_path / "labels.nrrd", ct)
     assert found.lps_from_index is ct.lps_from_index
     for z, y, x in np.ndindex(*found.data.shape):
         point = (ct.lps_from_index @ torch.tensor([x, y, z, 1.0], dtype=torch.float64))[:3].tolist()
@@ -449,6 +449,24 @@ def test_a_label_map_on_another_grid_is_resampled_by_nearest_neighbour(tmp_path:
         assert found.data[z, y, x] == (labels[nearest] if inside else 0)
     assert "labels.nrrd has a grid of its own" in told[0]
     assert "resampled by nearest neighbour" in told[0]
+
+
+@pytest.mark.parametrize(("voxels", "half"), [((0.5, 0.5, 0.5), True), ((-0.5, 0.5, -0.5), True), ((0, 0, 1), False)])
+def test_a_map_with_the_voxels_of_its_ct_and_another_origin_is_doubted(
+    tmp_path: Path, voxels: tuple[float, float, float], half: bool
+) -> None:
+    ct = Volume(torch.zeros(6, 7, 8), torch.eye(4, dtype=torch.float64))
+    labels = sitk.Image(8, 7, 6, sitk.sitkUInt8) + 1
+    sitk.WriteImage(labels, str(tmp_path / "same.nrrd"))
+    labels.SetOrigin(voxels)
+    sitk.WriteImage(labels, str(tmp_path / "moved.nrrd"))
+    sitk.WriteImage(labels[:, :, 1:], str(tmp_path / "cropped.nrrd"))
+    assert read_labels_told(tmp_path / "same.nrrd", ct).against == ()
+    assert read_labels_told(tmp_path / "cropped.nrrd", ct).against == ()
+    (told,) = read_labels_told(tmp_path / "moved.nrrd", ct).against
+    by = ", ".join(f"{each:.2f}" for each in voxels)
+    assert f"moved.nrrd has as many voxels as the CT, as large and along the same axes, but lies ({by}) mm LPS" in told
+    assert ("taken for a corner" in told) == half
 
 
 @pytest.mark.parametrize("suffix", [".nii.gz", ".mha", ".nrrd"])

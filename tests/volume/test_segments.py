@@ -108,7 +108,7 @@ def test_a_folder_with_a_mask_for_each_bone(tmp_path: Path, affine: np.ndarray) 
     table = read_bones(Fields({"labels": "segmentations"}, str(tmp_path / "case.yaml")), tmp_path, HIP)
     assert table == {"femur_left": (1,), "hip_left": (2,), "hip_right": (3,)}
     ct = Volume(torch.zeros(6, 7, 8), read_label_map(folder).lps_from_index)
-    labels, told = read_labels_told(folder, ct, {1, 2, 3})
+    labels, told, _ = read_labels_told(folder, ct, {1, 2, 3})
     counts = torch.bincount(labels.data.flatten()).tolist()
     assert counts[1:] == [18, 17]  # the voxel they share is the femur's; the liver was not read
     assert told == ("1 voxels lie in both femur_left and hip_left and count as the former",)

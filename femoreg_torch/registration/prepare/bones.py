@@ -32,9 +32,9 @@ def read_bones(case: Case) -> tuple[Volume, BoneLabels]:
             "`femoreg segment` makes one of the CT, `femoreg new-case --segment` the whole case."
         )
     ct, told = read_ct_told(case.ct_path)
-    labels, done = read_labels_told(case.labels_path, ct, {n for ids in case.bones.values() for n in ids})
+    labels, done, against = read_labels_told(case.labels_path, ct, {n for ids in case.bones.values() for n in ids})
     bones = bone_labels(labels, ct, case.bones, case.anatomy, case.landmarks)
-    return ct, replace(bones, notes=(*told, *done))
+    return ct, replace(bones, notes=(*told, *done), against=against)
 
 
 def ct_objects(

@@ -67,7 +67,7 @@ def prepare_scene(case: Case) -> Scene:
         if from_ct:
             objects = ct_objects(ct, bones, from_ct, case.anatomy, tuple(images))
             of_points, told_of_slices = heeding.result()
-            contradictions = *chain(*(each.result() for each in looking)), *of_points
+            contradictions = *bones.against, *chain(*(each.result() for each in looking)), *of_points
             told = (*told_of_ct, *told_of_slices, *told)
             outline = outlining.result()
         made = {name: model.result() for name, model in making.items()}
