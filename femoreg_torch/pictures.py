@@ -1,5 +1,6 @@
 """Pictures into files, and words onto pictures, by OpenCV."""
 
+import itertools
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,14 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
 def put_words(
     picture: np.ndarray, words: str, place: tuple[int, int], size: float, colour: tuple[int, int, int], line: int = 1
 ) -> None:
-    """Write words onto a picture from a place (column, row) on, with a dark rim: they are read on white as well."""
-    for ink, wide in (((0, 0, 0), line + 2), (colour, line)):
-        cv2.putText(picture, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, ink, wide, cv2.LINE_AA)
+    """Write words onto a picture from a place (column, row) on, with a dark rim: they are read on white as well.
+
+    The rim is the same words about the place: bolder ones would be wider, and so would not lie under these.
+    """
+    column, row = place
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    for right, down in itertools.product((-1, 0, 1), repeat=2):
+        cv2.putText(
+            picture, words, (column + right * line, row + down * line), font, size, (0, 0, 0), line, cv2.LINE_AA
+        )
+    cv2.putText(picture, words, place, font, size, colour, line, cv2.LINE_AA)
