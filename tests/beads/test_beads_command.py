@@ -237,8 +237,13 @@ def test_bad_input_ends_with_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_images_of_two_kinds_may_have_one_name(folder: Path, tmp_path: Path) -> None:
-    """Each kind in a folder of its own; the tool's shadows are measured again beside its edges, where it is seen."""
+def test_images_of_two_kinds_may_have_one_name(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each kind in a folder of its own; the tool's shadows are measured again beside its edges, where it is seen.
+
+    A result that is there already is told to be of another case.
+    """
     content = yaml.safe_load((folder / "case.yaml").read_text(encoding="utf-8"))
     for number, view in enumerate(content["views"], 1):
         for kind, name in view["images"].items():
@@ -247,8 +252,11 @@ def test_images_of_two_kinds_may_have_one_name(folder: Path, tmp_path: Path) -> 
             view["images"][kind] = f"{kind}/{number}.tif"
     (folder / "case.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
     out = tmp_path / "out"
+    (out / "run").mkdir(parents=True)
+    (out / "run" / "result.json").write_text("{}", encoding="utf-8")
     assert main(["beads", str(folder), "--beads", str(folder / "beads.yaml"), "--out", str(out)]) == 0
     assert read_json(out / "truth_uncertainty.json")["deviations"]["device"]["mm"] < 0.3  # 0.7 by the other images
+    assert "is of the case that was here before: register again" in " ".join(capsys.readouterr().out.split())
 
 
 def test_pixels_that_make_ellipses_of_beads_are_told(
