@@ -24,6 +24,7 @@ _BONE_HU, _METAL_HU = 200.0, 2800.0
 _LEAST_HIP_ML = 15.0  # of a hip bone; whole ones of adults have 180 to 400
 _LEAST_FEMUR_ML = 10.0
 _SHARES_MM = 3.0  # voxels on which the cuts' labels are averaged for the refinement; 1.5 to 2 mm gave the same
+_EMPTY_HU = -200.0  # mean below which a bone is none: marrow is fat, -100 HU, and bone is about it
 _LEAST_CONFIDENCE = 0.6  # mean probability of a bone; with less it is left out
 _LEAST_TOLD_ML = 0.5  # of what is left out; less are specks that nobody takes for a bone
 _DOUBTED = 0.85  # mean share of a bone below which a warning is given
@@ -108,7 +109,14 @@ def _looked_at(
     counts = torch.bincount(data.flatten(), minlength=1 + len(anatomy.bones)).tolist()
     voxel_ml = float(np.prod(ct.spacing_mm)) / 1000
     volume_ml = {name: n * voxel_ml for name, n in zip(anatomy.bone_names, counts[1:], strict=True) if n}
-    doubtful = [name for name, share in confidence.items() if share < _LEAST_CONFIDENCE]
+    sums = torch.bincount(data.flatten(), ct.data.flatten(), 1 + len(anatomy.bones)).tolist()
+    empty = {
+        name: total / n
+        for name, total, n in zip(anatomy.bone_names, sums[1:], counts[1:], strict=True)
+        if n and total / n < _EMPTY_HU
+    }
+    unsure = [name for name, share in confidence.items() if share < _LEAST_CONFIDENCE and name not in empty]
+    doubtful = [*empty, *unsure]
     hips = [side for side in ("left", "right") if _is_there(volume_ml, doubtful, f"hip_{side}", _LEAST_HIP_ML)]
     femora = [side for side in ("left", "right") if _is_there(volume_ml, doubtful, f"femur_{side}", _LEAST_FEMUR_ML)]
     if not hips or not femora:
@@ -120,10 +128,14 @@ def _looked_at(
     left_out = []
     for name in doubtful:
         data[data == 1 + anatomy.bone_names.index(name)] = 0
-        left_ml, share = volume_ml.pop(name), confidence.pop(name)
-        if left_ml >= _LEAST_TOLD_ML:
-            told = f"{left_ml:.0f} ml, mean probability {share:.2f}"
-            left_out.append(f"what may be {name} ({told}) was left out: the network is not sure")
+        left_ml, share = volume_ml.pop(name), confidence.pop(name, None)
+        if left_ml < _LEAST_TOLD_ML:
+            continue
+        if name in empty:
+            told, why = f"mean {empty[name]:.0f} HU", "no bone is as thin as air"
+        else:
+            told, why = f"mean probability {share:.2f}", "the network is not sure"
+        left_out.append(f"what may be {name} ({left_ml:.0f} ml, {told}) was left out: {why}")
     labels = Volume(data, ct.lps_from_index)
     warnings = left_out + _warnings(ct, labels, anatomy, volume_ml, confidence, hips)
     jointed = [f"{bone}_{side}" for side in hips for bone in ("hip", "femur") if side in femora]

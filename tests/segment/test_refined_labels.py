@@ -1,5 +1,7 @@
 """Labels on the CT's own voxels against solids whose shape is known."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -90,3 +92,15 @@ def test_what_is_mostly_of_one_side_is_wholly_of_it() -> None:
     mixed[:5][mixed[:5] == FEMUR_LEFT] = wrong
     found = segment_bones(Volume(ct.data, ct.lps_from_index), answering(shares_of(mixed, (3.0, 3.0, 3.0))))
     assert "femur_right" not in found.volume_ml
+
+
+def test_a_bone_of_air_is_left_out() -> None:
+    """As where a scan ends in a slanted plane, and the network goes on with the spine."""
+    ct, truth = hip_scene((3.0, 3.0, 3.0))
+    spine = slice(40, 52), slice(2, 14), slice(4, 16)
+    ct.data[spine], truth[spine] = -1000.0, 1 + HIP.bone_names.index("vertebrae")
+    found = segment_bones(ct, answering(shares_of(truth, (3.0, 3.0, 3.0))), refine=False)
+    assert set(found.volume_ml) == set(found.confidence) == {"hip_left", "femur_left"}
+    assert not (found.labels.data == 1 + HIP.bone_names.index("vertebrae")).any()
+    (told,) = (warning for warning in found.warnings if "vertebrae" in warning)
+    assert re.fullmatch(r"what may be vertebrae \(\d+ ml, mean -\d+ HU\) was left out: no bone is as thin as air", told)
