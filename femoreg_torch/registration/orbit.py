@@ -1,4 +1,4 @@
-"""Exhaustive search of the other views along the C-arm's orbit, and where that fails, of turned and tilted C-arms."""
+"""Exhaustive search of the other views along the C-arm's orbit, then of turned, tilted and rolled C-arms."""
 
 import math
 import time
@@ -39,6 +39,9 @@ _FURTHER_SHIFT = 2.0  # times `shift_mm`, away from the range of the orbit
 # 2 to 31° (views were tilted towards head or feet by up to 20°), and this one within 1.0 to 3.7°.
 _TURN_STEP_DEG, _TILT_STEP_DEG, _MOST_TILT_DEG = 4.0, 8.0, 32.0
 _MOST_TURN_OF_TILTED_DEG = 60.0
+# A C-arm that swings, or whose base is turned between the views, turns its image: by 8°, a view 7° from view 1 was not
+# found without a roll.
+_ROLL_DEG, _MOST_TURN_OF_ROLLED_DEG = 8.0, 60.0
 _COARSER_PIXEL, _COARSER_STEP = 1.25, 1.5  # times those of the level
 _ABOUT_DEG = (-6.0, 6.0, 7), (-3.0, 3.0, 5), (-4.0, 4.0, 3)  # about x, y and z of the camera: from, to, how many
 _ABOUT_SHIFT = 0.5  # times `shift_mm`
@@ -56,9 +59,9 @@ class OrbitSearch:
     similarity of patches bridges.
 
     A view whose best cost is above `further_above` is looked for further, up to `further_deg` along the orbit, and with
-    the C-arm turned so far about the patient's long axis and tilted towards head or feet, while what stands in the
-    middle of view 1 stays there: many users centre the hip again. That takes steps of its own, of 4° and 8°, and not
-    `step_deg`.
+    the C-arm turned so far about the patient's long axis, tilted towards head or feet, or rolled, while what stands in
+    the middle of view 1 stays there: many users centre the hip again. That takes steps of its own, of 4° and 8°, and
+    not `step_deg`.
     """
 
     name: str
@@ -167,9 +170,8 @@ def _further(scene: Scene, poses: Poses, search: OrbitSearch, view: int, draw: D
     middle = _middle(scene, poses)
     coarse, shift_mm = replace(search, level=coarser), _FURTHER_SHIFT * search.shift_mm
     # by themselves: shifted images of one orbit, whose isocentre is not where the file says, correlated best with all
-    every = [
-        _best(scene, poses, coarse, view, orbit, shift_mm, draw) for orbit in orbits(scene, poses, search.further_deg)
-    ]
+    tried = *orbits(scene, poses, search.further_deg), rolled(scene, poses, search.further_deg)
+    every = [_best(scene, poses, coarse, view, orbit, shift_mm, draw) for orbit in tried]
     found = min(every, key=lambda each: each.cost)
     grid = torch.cartesian_prod(*(torch.linspace(*each, dtype=torch.float64) for each in _ABOUT_DEG))
     centre = transform_points(found.camera_from_camera1, middle[None])[0]
@@ -191,6 +193,19 @@ def orbits(scene: Scene, poses: Poses, half_range_deg: float) -> tuple[Tensor, T
         about_middle.orbit(angles),
         tilted(poses.camera1_from[scene.anchor], middle, fewer),
     )
+
+
+def rolled(scene: Scene, poses: Poses, half_range_deg: float) -> Tensor:
+    """Poses (N, 4, 4) of a C-arm that was turned about the middle of view 1, and rolled, so that its image is turned.
+
+    The roll is about the middle as well, which stays where it is seen.
+    """
+    middle = _middle(scene, poses)
+    about_middle = replace(scene.carm, isocentre_mm=(0.0, 0.0, float(middle[2])))
+    turned = about_middle.orbit(orbit_angles(min(half_range_deg, _MOST_TURN_OF_ROLLED_DEG), _TURN_STEP_DEG))
+    centres = transform_points(turned, middle[None])[:, 0]  # (N, 3)
+    rolls = (about_point(rigid(_about("z", math.radians(deg))), centres) for deg in (-_ROLL_DEG, _ROLL_DEG))
+    return torch.cat([roll @ turned for roll in rolls])
 
 
 def _middle(scene: Scene, poses: Poses) -> Tensor:
