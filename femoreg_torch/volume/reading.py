@@ -203,7 +203,7 @@ def _origin_doubted(path: Path, beside: Tensor, like: Volume) -> str:
     """
     voxels = torch.linalg.solve(like.lps_from_index[:3, :3], beside).abs()
     half = " (half a voxel along each axis: was the origin taken for a corner?)" if _is_half(voxels) else ""
-    by = ", ".join(f"{mm + 0.0:.2f}" for mm in beside.tolist())
+    by = ", ".join(f"{mm:z.2f}" for mm in beside.tolist())
     return (
         f"the label map {path.name} has as many voxels as the CT, as large and along the same axes, but lies ({by}) mm "
         f"LPS beside it{half}: if it was drawn on this CT, give it the CT's origin, for one of both headers is wrong"
