@@ -23,10 +23,8 @@ def put_words(
 
     The rim is the same words about the place: bolder ones would be wider, and so would not lie under these.
     """
-    column, row = place
     font = cv2.FONT_HERSHEY_SIMPLEX
-    for right, down in itertools.product((-1, 0, 1), repeat=2):
-        cv2.putText(
-            picture, words, (column + right * line, row + down * line), font, size, (0, 0, 0), line, cv2.LINE_AA
-        )
+    for right, down in itertools.product((-line, 0, line), repeat=2):
+        beside = place[0] + right, place[1] + down
+        cv2.putText(picture, words, beside, font, size, (0, 0, 0), line, cv2.LINE_AA)
     cv2.putText(picture, words, place, font, size, colour, line, cv2.LINE_AA)

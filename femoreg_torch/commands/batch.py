@@ -89,8 +89,9 @@ def batch(
         for done, (job, row) in enumerate(run_jobs(left, jobs), 1):
             rows[job.case] = row
             told = f"{done} of {len(left)}: {row.case} {row.status}"
-            report(told, done / len(left))
-            if not console.is_interactive:  # a log shows no bar
+            if console.is_interactive:
+                report(told, done / len(left))
+            else:  # a log shows no bar, and is told of every case
                 console.print(told, markup=False, highlight=False, soft_wrap=True)
             _write_table([rows[job.case] for job in waiting if job.case in rows], out / "table.csv")
         table = [rows[job.case] for job in waiting]

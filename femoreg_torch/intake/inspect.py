@@ -47,6 +47,7 @@ _MESHES = (".stl", ".ply", ".obj", ".off", ".3mf", ".glb", ".step", ".stp")
 _POINTS = (".fcsv", ".json", ".csv", ".tsv")
 _TRANSFORMS = (".tfm", ".h5", ".mat")
 _PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+_BY_ONE_FILE = ("case", "result")  # kinds of folders that one file makes what they are
 _BESIDE_A_RESULT = ("errors.json", "navigation.json", "overlay.png", "replay.gif", "report.html", "review.json")
 _TRUTH_NAME = "truth.json"
 _LISTED = 40  # entries of a folder
@@ -177,7 +178,7 @@ def _in_short(entry: Path) -> str:
             told = "; ".join(one.told for one in series_in(entry))
             nothing = "more folders" if any(inner.is_dir() for inner in _entries(entry)) else "nothing known here"
             return f"{entry.name}: folder, {told or nothing}"
-        return f"{entry.name}: {'folder of ' if kind.endswith('s') else ''}{kind}"
+        return f"{entry.name}: {'' if kind in _BY_ONE_FILE else 'folder of '}{kind}"
     try:
         found = inspect_path(entry)
     except InputError as error:

@@ -186,11 +186,10 @@ def orbits(scene: Scene, poses: Poses, half_range_deg: float) -> tuple[Tensor, T
     Who centres the hip again after the turn brings the middle back there, whatever the C-arm turned about.
     """
     angles, middle = orbit_angles(half_range_deg, _TURN_STEP_DEG), _middle(scene, poses)
-    about_middle = replace(scene.carm, isocentre_mm=(0.0, 0.0, float(middle[2])))
     fewer = orbit_angles(min(half_range_deg, _MOST_TURN_OF_TILTED_DEG), _TURN_STEP_DEG)
     return (
         scene.carm.orbit(angles),
-        about_middle.orbit(angles),
+        _turned(scene, middle, angles),
         tilted(poses.camera1_from[scene.anchor], middle, fewer),
     )
 
@@ -198,14 +197,18 @@ def orbits(scene: Scene, poses: Poses, half_range_deg: float) -> tuple[Tensor, T
 def rolled(scene: Scene, poses: Poses, half_range_deg: float) -> Tensor:
     """Poses (N, 4, 4) of a C-arm that was turned about the middle of view 1, and rolled, so that its image is turned.
 
-    The roll is about the middle as well, which stays where it is seen.
+    The roll leaves the middle where it is seen.
     """
     middle = _middle(scene, poses)
-    about_middle = replace(scene.carm, isocentre_mm=(0.0, 0.0, float(middle[2])))
-    turned = about_middle.orbit(orbit_angles(min(half_range_deg, _MOST_TURN_OF_ROLLED_DEG), _TURN_STEP_DEG))
+    turned = _turned(scene, middle, orbit_angles(min(half_range_deg, _MOST_TURN_OF_ROLLED_DEG), _TURN_STEP_DEG))
     centres = transform_points(turned, middle[None])[:, 0]  # (N, 3)
     rolls = (about_point(rigid(_about("z", math.radians(deg))), centres) for deg in (-_ROLL_DEG, _ROLL_DEG))
     return torch.cat([roll @ turned for roll in rolls])
+
+
+def _turned(scene: Scene, middle: Tensor, angles: Tensor) -> Tensor:
+    """Poses (N, 4, 4) of the C-arm, turned by `angles` (N,) about a point of the central beam as deep as `middle`."""
+    return replace(scene.carm, isocentre_mm=(0.0, 0.0, float(middle[2]))).orbit(angles)
 
 
 def _middle(scene: Scene, poses: Poses) -> Tensor:

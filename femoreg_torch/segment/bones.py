@@ -109,7 +109,8 @@ def _looked_at(
     counts = torch.bincount(data.flatten(), minlength=1 + len(anatomy.bones)).tolist()
     voxel_ml = float(np.prod(ct.spacing_mm)) / 1000
     volume_ml = {name: n * voxel_ml for name, n in zip(anatomy.bone_names, counts[1:], strict=True) if n}
-    sums = torch.bincount(data.flatten(), ct.data.flatten(), 1 + len(anatomy.bones)).tolist()
+    labelled = data > 0
+    sums = torch.bincount(data[labelled], ct.data[labelled].double(), 1 + len(anatomy.bones)).tolist()
     empty = {
         name: total / n
         for name, total, n in zip(anatomy.bone_names, sums[1:], counts[1:], strict=True)

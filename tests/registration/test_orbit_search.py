@@ -9,6 +9,7 @@ import torch
 from registration_scenes import CARM, REFERENCE_POINTS, error, float64, make_scene, true_poses
 from scipy.spatial.transform import Rotation
 
+from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.geometry import Poses, about_point, exp_se3, exp_so3, rigid, transform_points
 from femoreg_torch.registration import Level, OrbitSearch
 from femoreg_torch.registration.orbit import search_orbit, tilted
@@ -24,6 +25,15 @@ def moved(view: int) -> Poses:
     pelvis = transform_points(poses.camera_from("pelvis")[view], REFERENCE_POINTS["pelvis"][None])[0]
     off = about_point(exp_se3(float64(0.01, -0.012, 0.015, *OFF_MM)), pelvis)
     return poses.with_view(view, off @ poses.camera_from_camera1[view])
+
+
+def looked_for_further(truth: Poses, further_above: float) -> tuple[StageRecord, float, float]:
+    """What the search from view 1 finds of view 2, and how far the pelvis is off there, mm and degrees."""
+    search = replace(SEARCH, shift_mm=30.0, further_deg=100.0, further_above=further_above)
+    known = truth.with_view(1, torch.eye(4, dtype=torch.float64))
+    found = search_orbit(make_scene(truth, with_device=False), known, search, 1)
+    mm, deg = error(found.poses.camera_from("pelvis")[1], truth.camera_from("pelvis")[1], REFERENCE_POINTS["pelvis"])
+    return found, mm, deg
 
 
 @pytest.mark.parametrize("view", [1, 2])
@@ -63,10 +73,7 @@ def test_a_view_from_far_off_is_found(angle_deg: float, centred: bool) -> None:
     depth = float(transform_points(poses.camera1_from["femur"], REFERENCE_POINTS["femur"][None])[0, 2])
     carm = replace(CARM, isocentre_mm=(0.0, 0.0, depth)) if centred else CARM
     truth = poses.with_view(1, carm.orbit(float64(math.radians(angle_deg))))
-    scene = make_scene(truth, with_device=False)
-    search = replace(SEARCH, shift_mm=30.0, further_deg=100.0, further_above=0.6)
-    found = search_orbit(scene, truth.with_view(1, torch.eye(4, dtype=torch.float64)), search, 1)
-    mm, deg = error(found.poses.camera_from("pelvis")[1], truth.camera_from("pelvis")[1], REFERENCE_POINTS["pelvis"])
+    found, mm, deg = looked_for_further(truth, 0.6)
     assert mm < 25  # along the beam
     assert deg < 3
     assert found.evaluations == 81 + 12 + 2 * (51 + 12) + 31 * (9 + 8) + 12 + (2 * 31 + 12) + 105 + 12
@@ -103,10 +110,7 @@ def test_a_rolled_view_is_found(turn_deg: float, roll_deg: float) -> None:
     turn, roll = float64(0, math.radians(turn_deg), 0), float64(0, 0, math.radians(roll_deg))
     moved_by = about_point(exp_se3(torch.cat([roll, float64(9, -7, 5)])) @ rigid(exp_so3(turn)), pelvis)
     truth = poses.with_view(1, moved_by)
-    scene = make_scene(truth, with_device=False)
-    search = replace(SEARCH, shift_mm=30.0, further_deg=100.0, further_above=0.3)
-    found = search_orbit(scene, truth.with_view(1, torch.eye(4, dtype=torch.float64)), search, 1)
-    mm, deg = error(found.poses.camera_from("pelvis")[1], truth.camera_from("pelvis")[1], REFERENCE_POINTS["pelvis"])
+    _, mm, deg = looked_for_further(truth, 0.3)
     assert mm < 20  # along the beam
     assert deg < 3
 
