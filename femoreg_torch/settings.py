@@ -4,11 +4,12 @@ import dataclasses
 import functools
 import json
 import re
+from argparse import Action
 from collections.abc import Iterator, Mapping
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from jsonargparse import ArgumentError, ArgumentParser, set_dumper, set_loader
+from jsonargparse import ArgumentError, ArgumentParser, DefaultHelpFormatter, set_dumper, set_loader
 
 from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.text import check_no_aliases, yaml_content
@@ -23,7 +24,30 @@ def plain_parser(**settings: Any) -> ArgumentParser:
     """A parser of jsonargparse that raises `ArgumentError`, and reads YAML as `femoreg_torch.text` does."""
     set_loader(_MODE, _argument, exceptions=(InputError,))
     set_dumper(_MODE, json.dumps)
-    return ArgumentParser(exit_on_error=False, parser_mode=_MODE, **settings)
+    return ArgumentParser(exit_on_error=False, parser_mode=_MODE, formatter_class=_Help, **settings)
+
+
+class _Help(DefaultHelpFormatter):
+    """Tells the kind of a value in words, and no default where there is none."""
+
+    def _get_help_string(self, action: Action) -> str:
+        kind = self._get_type_str(action)
+        if kind is None:  # a flag, or one of the parser's own
+            return "" if action.help is None else super()._get_help_string(action).removesuffix(_DEFAULT_OF_A_FLAG)
+        notes = ["required"] if action.required else []
+        if words := _kind_in_words(kind):
+            notes.append(words)
+        if not action.required and action.default is not None:
+            notes.append("default: %(default)s")
+        return f"{action.help or ''} ({'; '.join(notes)})" if notes else action.help or ""
+
+
+def _kind_in_words(kind: str) -> str:
+    """How help tells the type of a value, which jsonargparse writes as Python does; a choice lists its words itself."""
+    kind = _CLASS.sub(r"\1", kind).removesuffix(" | null")
+    if listed := re.fullmatch(r"(?:list|tuple)\[(\w+)(?:, \.\.\.)?\]", kind):
+        return f"{LIST} of {_WORDS_OF_MANY[listed[1]]}"
+    return "" if kind.startswith("Literal") else _WORDS.get(kind, kind.lower())
 
 
 def _argument(text: str) -> Any:
@@ -42,9 +66,10 @@ _REFUSED = re.compile(
     r"(?:Expected an? (.*?)\.|(.*?) was expected\.)(?: Given value type: \S+)? (?:Given|Got) value: ?(.*)"
 )
 _KEY = re.compile(r'Parser key "([^"]*)": (.*)')
-_WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text"}
+_WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "Path": "a path"}
 _WORDS_OF_MANY = {"int": "whole numbers", "float": "numbers", "str": "texts", "Path": "paths"}
 _CHOICE = re.compile(r"typing\.Literal\[(.*)\]")
+_DEFAULT_OF_A_FLAG = " (default: %(default)s)"  # as jsonargparse writes it
 LIST = "a list"  # how `told` begins where one was expected
 
 

@@ -124,6 +124,21 @@ def test_help_of_a_command_teaches(capsys: pytest.CaptureFixture[str]) -> None:
         assert words in text
 
 
+def test_help_tells_kinds_of_values_in_words(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["measure", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for words in (
+        "Where to write. (required; a path)",
+        "The C-arm. (text; default: cios_fusion)",
+        "(a number; default: 1.0)",
+    ):
+        assert words in text
+    assert text.endswith("Draw it, too.")  # a flag has no value
+    for foreign in ("<class", "null", "Literal", "type:"):
+        assert foreign not in text
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
