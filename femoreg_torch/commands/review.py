@@ -78,6 +78,7 @@ def review(
             serve(review_app(desk, token), listening)
         finally:
             desk.close()
+        console.print("Review ended.")
 
 
 def _case_and_run(folder: Path, case: Path | None, out: Path | None) -> tuple[Path, Path]:

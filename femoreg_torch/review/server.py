@@ -8,6 +8,7 @@ and changes only from the page itself. Pages load nothing from outside, and no r
 import hmac
 import socket
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from urllib.parse import parse_qs
 
@@ -174,4 +175,5 @@ def _complaint(fields: dict[str, str]) -> str:
 
 def serve(app: Starlette, listening: socket.socket) -> None:
     """Serve until the user stops it, on a socket that listens already."""
-    uvicorn.Server(uvicorn.Config(app, log_level="error", server_header=False)).run(sockets=[listening])
+    with suppress(KeyboardInterrupt):  # Ctrl-C is how a review ends
+        uvicorn.Server(uvicorn.Config(app, log_level="error", server_header=False)).run(sockets=[listening])

@@ -1,7 +1,9 @@
 """The server of a review: who is let in, what is written and when not, and a server that is killed."""
 
 import multiprocessing
+import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -210,17 +212,31 @@ with only_review(Path({str(run)!r})):
     assert list(run.parent.iterdir()) == []
 
 
-def test_a_server_that_is_killed_leaves_what_was_there(desk: Desk, run: Path) -> None:
-    """A real server dies in the middle of a decision that is being sent."""
-    write_review(run, Review("rejected", "first", "A. Surgeon", "2026-01-01T00:00:00+00:00", result_sha256(run)))
-    before = (run / REVIEW_NAME).read_bytes()
+def started_server(desk: Desk) -> tuple[tuple[str, int], multiprocessing.process.BaseProcess]:
+    """A real server in a process of its own: its address, and the process."""
     app = review_app(desk, TOKEN)
     with socket.socket() as listening:
         listening.bind((LOOPBACK, 0))
         listening.listen()  # so that what comes before the server is ready waits for it
-        address = listening.getsockname()
         server = multiprocessing.get_context("fork").Process(target=serve, args=(app, listening))
         server.start()
+        return listening.getsockname(), server
+
+
+def test_ctrl_c_ends_a_server_without_complaint(desk: Desk) -> None:
+    address, server = started_server(desk)
+    assert httpx.get(f"http://{LOOPBACK}:{address[1]}/{TOKEN}/", timeout=60, trust_env=False).status_code == 200
+    assert server.pid is not None
+    os.kill(server.pid, signal.SIGINT)
+    server.join(60)
+    assert server.exitcode == 0
+
+
+def test_a_server_that_is_killed_leaves_what_was_there(desk: Desk, run: Path) -> None:
+    """A real server dies in the middle of a decision that is being sent."""
+    write_review(run, Review("rejected", "first", "A. Surgeon", "2026-01-01T00:00:00+00:00", result_sha256(run)))
+    before = (run / REVIEW_NAME).read_bytes()
+    address, server = started_server(desk)
     try:
         assert httpx.get(f"http://{LOOPBACK}:{address[1]}/{TOKEN}/", timeout=60, trust_env=False).status_code == 200
         with socket.create_connection(address) as half:
