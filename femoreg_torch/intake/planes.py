@@ -22,7 +22,8 @@ _JOINT_MM = 55.0  # to all sides of a femoral head's centre: the whole socket
 _CELL_PX, _COLUMNS = 300, 3  # of images side by side
 _ENDS_PERCENT = (0.5, 99.5)  # of the pixels, that set the window of an image
 _TINT = 0.35
-_WHITE, _YELLOW = (255, 255, 255), (60, 230, 255)
+_NEAR_MM = 12.0  # of a point before or behind a plane
+_WHITE, _YELLOW, _DIM = (255, 255, 255), (60, 230, 255), (40, 110, 120)
 
 
 def three_planes(
@@ -36,7 +37,7 @@ def three_planes(
     """Axial, coronal and sagittal plane through `centre` (3,), LPS mm (by default the middle of what is labelled).
 
     `grey` is a CT in HU (anything else is shown from its least to its greatest value), `labels` a map on the same grid
-    with RGB `colours` of its ids, `marks` points (3,) by name, LPS mm, drawn where they lie before or behind the plane.
+    with RGB `colours` of its ids, `marks` points (3,) by name, LPS mm: those near a plane are named, others dim there.
     One of `grey` and `labels` must be there. `caption` stands before the name of each plane.
     """
     volume = grey if grey is not None else labels
@@ -59,8 +60,11 @@ def three_planes(
             column = (where[across] + 0.5) * volume.spacing_mm[across] / spacing
             row = (where[down] + 0.5) * volume.spacing_mm[down] / spacing
             row = size[1] - row if down == 2 else row
-            cv2.drawMarker(panel, (round(column), round(row)), _YELLOW, cv2.MARKER_CROSS, 8, 1, cv2.LINE_AA)
-            put_words(panel, mark, (round(column) + 5, round(row) - 4), 0.35, _YELLOW)
+            near = abs(where[axis] - at[axis]) * volume.spacing_mm[axis] <= _NEAR_MM
+            colour = _YELLOW if near else _DIM
+            cv2.drawMarker(panel, (round(column), round(row)), colour, cv2.MARKER_CROSS, 8, 1, cv2.LINE_AA)
+            if near:
+                put_words(panel, mark, (round(column) + 5, round(row) - 4), 0.35, colour)
         left, right = ("front", "back") if axis == 0 else ("R", "L")
         panels.append(_captioned(panel, f"{caption}{name}", left, right))
     height = max(panel.shape[0] for panel in panels)
