@@ -77,8 +77,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return content
 
 
-def last_good_checkpoint(folder: Path, module: nn.Module, report: Callable[[str], None]) -> Path:
-    """The newest checkpoint in `folder` that is whole; each that is passed over is told to `report`.
+def last_good_checkpoint(folder: Path, module: nn.Module, report: Callable[[str], None]) -> tuple[Path, int]:
+    """The newest checkpoint in `folder` that is whole, and after how many epochs it was written.
+
+    Each that is passed over is told to `report`.
 
     Raises `InputError` if there is none, or if it is of another network than `module`.
     """
@@ -93,7 +95,7 @@ def last_good_checkpoint(folder: Path, module: nn.Module, report: Callable[[str]
         if missing := [name for name in _STATE if name not in content]:
             report(f"passed over: {path}: holds weights, but not the state of a run ({missing[0]} is missing).")
             continue
-        return path
+        return path, int(content["epoch"]) + 1
     raise InputError(
         f"{folder}: holds no whole checkpoint, so there is nothing to resume. Train anew into another folder."
     )

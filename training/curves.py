@@ -38,4 +38,4 @@ def draw_curves(events: Path, picture: Path) -> None:
 def _plot(axes: Axes, log: EventAccumulator, tag: str, label: str, colour: str, opacity: float) -> None:
     if tag in log.Tags()["scalars"]:
         scalars = log.Scalars(tag)
-        axes.plot([s.step for s in scalars], [s.value for s in scalars], label=label, color=colour, alpha=opacity)
+        axes.plot([s.step + 1 for s in scalars], [s.value for s in scalars], label=label, color=colour, alpha=opacity)

@@ -87,7 +87,8 @@ class NetworkTraining(LightningModule):
             "validation/visibility": correct,
             "validation/pixel_accuracy": overlap,
         }
-        self.log_dict(values, batch_size=len(batch.images), prog_bar=True, sync_dist=True)
+        self.log_dict(values, batch_size=len(batch.images), sync_dist=True)
+        self.log("loss", losses["loss"], logger=False, prog_bar=True, sync_dist=True)  # more fits into no terminal
         return prediction._asdict()
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:

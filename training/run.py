@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from lightning import Trainer, seed_everything
@@ -26,7 +27,7 @@ from femoreg_torch.case import case_folder
 from femoreg_torch.detect import load_network
 from femoreg_torch.detect.grid import NETWORK_SIZE
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import clear_leftovers, temporary_file, write_json
+from femoreg_torch.files import clear_leftovers, read_json, temporary_file, write_json
 from models.weights import SHIPPED_WEIGHTS, Weights, save_weights
 from training.card import write_card
 from training.checkpoints import BestCheckpoint, WholeCheckpoints, last_good_checkpoint, read_checkpoint
@@ -39,6 +40,7 @@ from training.settings import TrainingSettings
 
 _MONITORED = "validation/loss"
 _CSV, _TENSORBOARD = "csv", "tensorboard"  # folders of logs
+_SETTINGS = "settings.json"
 
 
 @dataclass(frozen=True)
@@ -77,12 +79,23 @@ def train_network(
         raise InputError(f"{last}: no such file, so there is nothing to resume. Leave out --resume.")
     if not resume and any(last.parent.glob("*.ckpt")):
         raise InputError(f"{out}: holds a training run. Continue it with --resume, or choose another folder.")
+    if resume and start is not None:
+        raise InputError("--start: a run that is resumed goes on with its own weights. Leave out --start or --resume.")
     _check_machine(machine)
     run = settings.run
+    about = {**settings.as_content(), "cases": [case.resolve().name for case in cases]}
     resumed = None
     if resume:
         like = NetworkTraining(settings.network, settings.loss, run.optimisation)
-        resumed = last_good_checkpoint(last.parent, like, console.print)
+        resumed, epochs = last_good_checkpoint(last.parent, like, console.print)
+        _check_same_run(out / _SETTINGS, about)
+        if epochs > run.optimisation.epochs:
+            raise InputError(
+                f"--resume: this run has had {epochs} epochs, and the settings ask for {run.optimisation.epochs}. Ask "
+                f"for more, as --override '[optimisation.epochs={epochs + 1}]' does."
+            )
+        left = run.optimisation.epochs - epochs
+        console.print(f"After {epochs} epochs, {left} are left." if left else "All epochs are done.", markup=False)
     elif start is not None:
         begin_with(start, settings.network.build())  # complains before anything is rendered
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)  # or advice of its own stands on stderr
@@ -92,7 +105,7 @@ def train_network(
         shutil.rmtree(out / name, ignore_errors=True)
     clear_leftovers(last.parent)
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "settings.json", {**settings.as_content(), "cases": [case.resolve().name for case in cases]})
+    write_json(out / _SETTINGS, about)
     seed_everything(run.seed, verbose=False)
     optimisation = run.optimisation
     data = ViewData(
@@ -133,8 +146,13 @@ def train_network(
         log_every_n_steps=min(25, optimisation.batches_per_epoch),
         limit_val_batches=1.0 if cohort.validation else 0,
     )
+    if machine.nodes > 1:
+        console.print(f"Waiting until the command runs on all of {machine.nodes} machines.")
     try:
         trainer.fit(module, data, ckpt_path=resumed)
+    except SystemExit as stopped:  # how Lightning ends on Ctrl-C, and where the system ends it
+        kept = "go on with --resume" if any(last.parent.glob("*.ckpt")) else "no epoch had ended, so nothing is kept"
+        raise KeyboardInterrupt(f"interrupted; {kept}.") from stopped
     except OSError as error:
         if error.filename is None and error.errno is not None:  # the system does not say for which file
             raise OSError(error.errno, error.strerror, str(out)) from error
@@ -144,7 +162,20 @@ def train_network(
     draw_curves(out / _TENSORBOARD, out / "curves.png")
     weights = export_weights(Path(best.best_model_path), settings, out / SHIPPED_WEIGHTS)
     write_card(out / "card.md", settings, cases, out / _TENSORBOARD, trainer.current_epoch)
+    console.print(f"Weights written to {weights}", markup=False, soft_wrap=True)
     return weights
+
+
+def _check_same_run(file: Path, about: dict[str, Any]) -> None:
+    """Raises `InputError` if a run was begun with another network, loss, patients or images than `about` tells."""
+    begun = read_json(file) if file.exists() else {}
+    now = json.loads(json.dumps(about))
+    for group in ("network", "loss", "cohort", "cases"):
+        if begun.get(group, now[group]) != now[group]:
+            raise InputError(
+                f"--resume: the settings of this run, {file}, have another `{group}` than those that were given. "
+                "Resume it with its own, or begin another run from its weights with --start."
+            )
 
 
 def _check_machine(machine: Machine) -> None:

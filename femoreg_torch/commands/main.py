@@ -87,8 +87,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(f"{_place(error)}: {error.strerror or error}.")
     except MemoryError:
         return _complain("the memory does not suffice. Close other programs, or crop the volumes.")
-    except KeyboardInterrupt:
-        _complain("interrupted.")
+    except KeyboardInterrupt as stop:
+        _complain(str(stop) or "interrupted.")
         return INTERRUPTED
     except Exception as error:
         return _tell_defect(error)

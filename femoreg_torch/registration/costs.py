@@ -30,6 +30,7 @@ from femoreg_torch.similarity import FixedSimilarity, Similarity, similarity_qua
 from femoreg_torch.volume import Volume
 
 _STEP = 1e-5  # of a delta, for the derivatives of poses
+_DEFORMED = 0.005  # of a shape, for what is drawn: edges of a pelvis move by half a millimetre
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +85,14 @@ class ImageCosts:
         """Costs (images,) of what stands still alone."""
         return torch.cat([target.cost(target.background[None]) for target in self.targets]).cpu()
 
-    def quadratics(self, delta: Tensor, unsure: Sequence[tuple[str, Volume]] = ()) -> list[Quadratic]:
+    def quadratics(
+        self, delta: Tensor, unsure: Sequence[tuple[str, Volume]] = (), shapes: Sequence[Mapping[str, Tensor]] = ()
+    ) -> list[Quadratic]:
         """Each image's cost about one delta (Σ n_b,), with exact gradient and positive semi-definite curvature.
 
-        The last unknowns are the amounts of what is `unsure`, differences that come to the volumes of objects by name.
-        All of it on the CPU; a device is waited for once.
+        The next unknowns are the amounts of what is `unsure`, differences that come to the volumes of objects by name.
+        The last are those of the `shapes`: by each, objects are deformed at once, by name at the rate (4, 4) by which
+        points of their space move. All of it on the CPU; a device is waited for once.
         """
         steps = _STEP * torch.eye(len(delta), dtype=torch.float64)
         for _, chosen in self._intrinsics(torch.eye(len(delta), dtype=torch.float64)):
@@ -109,7 +113,7 @@ class ImageCosts:
             drawn = on_all_cores(lambda each: self._image_and_jacobian(delta, each), jobs, self._device)
         seen = dict(zip(wanted, drawn, strict=True))
         about = [
-            partial(self._changes, target, delta, poses, seen, unsure)
+            partial(self._changes, target, delta, poses, seen, unsure, shapes)
             for target, (poses, _) in zip(moving, placed, strict=True)
         ]
         found = iter(zip(similarity_quadratics(about, self._device), placed, strict=True))
@@ -117,12 +121,13 @@ class ImageCosts:
         for target in self.targets:
             if target.moving:
                 (cost, scores, hessian), (_, twists) = next(found)
-                amounts = torch.eye(len(unsure), dtype=torch.float64)
-                shown = amounts[[name in target.moving for name, _ in unsure]]
-                ways = torch.block_diag(twists, shown) if unsure else twists
+                amounts = torch.eye(len(unsure) + len(shapes), dtype=torch.float64)
+                shown = amounts[[name in target.moving for name, _ in unsure] + [True] * len(shapes)]
+                ways = torch.block_diag(twists, shown) if len(amounts) else twists
                 models.append(Quadratic(cost, scores @ ways, ways.T @ hessian @ ways))
             else:
-                nothing = delta.new_zeros(len(delta) + len(unsure), len(delta) + len(unsure))
+                unknowns = len(delta) + len(unsure) + len(shapes)
+                nothing = delta.new_zeros(unknowns, unknowns)
                 models.append(Quadratic(float(target.cost(target.background[None])), nothing[:1], nothing))
         return models
 
@@ -219,11 +224,12 @@ class ImageCosts:
         poses: Tensor,
         seen: dict[tuple[int, str], tuple[Tensor, Tensor]],
         unsure: Sequence[tuple[str, Volume]],
+        shapes: Sequence[Mapping[str, Tensor]],
     ) -> tuple[FixedSimilarity, Tensor, Tensor]:
         """The similarity of an image, what is drawn at a delta (n,), and its changes (H, W, m).
 
-        By the twists, and by what is `unsure` of what moves. That lies at `poses` (O, 4, 4). `seen` holds each object
-        by itself in each view.
+        By the twists, by what is `unsure` of what moves, and by the `shapes`. That lies at `poses` (O, 4, 4). `seen`
+        holds each object by itself in each view.
         """
         drawn, jacobians = target.background, []
         camera = self._camera(target, delta[None])
@@ -243,6 +249,14 @@ class ImageCosts:
                 place = poses[target.moving.index(name)][None, None]
                 change = project([difference], place, camera, self.step_mm)
                 jacobians.append(change * hardened_slope(seen[target.view, name][0], self.objects[name].hardening))
+        for rates in shapes:
+            change = torch.zeros_like(target.background)[None]
+            for name in set(rates) & set(target.moving):
+                pose, rate = poses[target.moving.index(name)], _DEFORMED * rates[name]
+                deformed = pose @ torch.stack([torch.eye(4) + rate, torch.eye(4) - rate])
+                more, less = draw([self.objects[name]], deformed[:, None], camera, self.step_mm)
+                change = change + (more - less) / (2 * _DEFORMED)
+            jacobians.append(change)
         changes = torch.cat(jacobians)
         if target.scatter is not None:
             changes *= filled_slope(below_white(drawn, target.white), target.scatter)

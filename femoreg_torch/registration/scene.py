@@ -189,6 +189,11 @@ class Scene:
         """Those of the named objects that images of a kind hold."""
         return [name for name in names if kind in self.objects[name].shown_in]
 
+    def first_images(self, name: str) -> list[tuple[Kind, int]]:
+        """The first image, (kind, view), of every view that shows an object."""
+        shown = self.objects[name].shown_in
+        return [image for view in range(self.views) for image in self.there(shown, (view,))[:1]]
+
     def start(self, camera1_from_anchor: Tensor | None = None) -> Poses:
         """Poses at the start of all objects that any image holds, given where landmarks put the anchor, (4, 4).
 

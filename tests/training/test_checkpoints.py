@@ -40,11 +40,11 @@ def test_a_truncated_checkpoint_is_told_and_passed_over(tmp_path: Path) -> None:
     last = written(tmp_path / "last.ckpt", module, 0)
     best = written(tmp_path / "best.ckpt", module, 60)
     told: list[str] = []
-    assert last_good_checkpoint(tmp_path, module, told.append) == last
+    assert last_good_checkpoint(tmp_path, module, told.append) == (last, 2)
     content = last.read_bytes()
     for length in (0, 10, len(content) // 2, len(content) - 10):
         last.write_bytes(content[:length])
-        assert last_good_checkpoint(tmp_path, module, told.append) == best
+        assert last_good_checkpoint(tmp_path, module, told.append) == (best, 2)
     assert len(told) == 4
     assert all("last.ckpt: is cut off" in line and "\n" not in line for line in told)
     best.write_bytes(b"")
@@ -79,7 +79,7 @@ def test_weights_without_the_state_of_a_run_are_passed_over(tmp_path: Path) -> N
     best = written(tmp_path / "best.ckpt", module, 60)
     torch.save({"state_dict": module.state_dict(), "global_step": 9}, tmp_path / "last.ckpt")
     told: list[str] = []
-    assert last_good_checkpoint(tmp_path, module, told.append) == best
+    assert last_good_checkpoint(tmp_path, module, told.append) == (best, 2)
     assert "last.ckpt: holds weights, but not the state of a run" in told[0]
 
 

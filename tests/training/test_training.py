@@ -2,10 +2,12 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from lightning import Trainer
 from lightning.pytorch.callbacks import RichProgressBar, TQDMProgressBar
 from rich.console import Console
 from safetensors.torch import load_file
@@ -99,12 +101,38 @@ def test_a_run_exports_weights_that_load_and_can_be_resumed(
     assert {path.stat().st_mode & 0o777 for path in (weights, *cache.iterdir())} == {usual_mode(tmp_path)}
     second = load_network(weights).module.state_dict()
     assert any(not torch.equal(first[name], second[name]) for name in first)
+    again = partial(train, settings, out=out, cache=cache, resume=True)
+    with pytest.raises(InputError, match="has had 2 epochs, and the settings ask for 1"):
+        again(cases=[case], override=["optimisation.epochs=1"])
+    with pytest.raises(InputError, match="another `cases`"):
+        again(override=["optimisation.epochs=3"])
+    with pytest.raises(InputError, match="another `cohort`"):
+        again(cases=[case], override=["cohort.views=5"])
+    with pytest.raises(InputError, match="goes on with its own weights"):
+        again(cases=[case], start=weights)
     card = (out / "card.md").read_text(encoding="utf-8")
     assert "4 steps of 2 images (8 images)" in card
     assert f"| {case.name} | 2 | 6 | not told | not told |" in card
     views = ViewBatches(sorted(cache.glob("*_??.safetensors")), 2, read_settings(settings).run.augmentation, 1, 4)
     assert views[3].images.equal(views[3].images)
     assert not views[2].images.equal(views[3].images)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_run_that_is_interrupted_says_how_it_goes_on(
+    settings: str, case: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: bool
+) -> None:
+    """Lightning leaves Python where Ctrl-C is pressed, and where the system ends it."""
+
+    def stopped(*_: object, **__: object) -> None:
+        if kept:
+            (tmp_path / "run" / "checkpoints").mkdir()
+            (tmp_path / "run" / "checkpoints" / "last.ckpt").touch()
+        raise SystemExit(1)
+
+    monkeypatch.setattr(Trainer, "fit", stopped)
+    with pytest.raises(KeyboardInterrupt, match="go on with --resume" if kept else "nothing is kept"):
+        train(settings, out=tmp_path / "run", cases=[case])
 
 
 def test_a_cache_of_other_settings_is_refused(settings: str, case: Path, tmp_path: Path) -> None:

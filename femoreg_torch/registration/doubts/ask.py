@@ -7,6 +7,7 @@ from femoreg_torch.case import Case
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.geometry import Poses
 from femoreg_torch.registration.doubts.carm import doubts_about_the_carm, doubts_about_the_views
+from femoreg_torch.registration.doubts.ct import doubts_about_the_ct
 from femoreg_torch.registration.doubts.device import (
     doubts_about_size,
     doubts_about_the_models,
@@ -43,6 +44,7 @@ def doubts(
         lambda: doubts_about_motion(covariance, limits, given=scene.camera_from_camera1 is not None),
     ]
     questions: list[Callable[[], tuple[str, ...]]] = [
+        lambda: doubts_about_the_ct(case, clear, poses, imaging),  # such a CT seems to have moved or bent as well
         *(geometry[::-1] if explains_the_carm(covariance) else geometry),
         lambda: doubts_about_the_plan(case, scene),
         lambda: doubts_about_the_guide(case, poses),

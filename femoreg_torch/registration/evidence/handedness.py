@@ -47,9 +47,7 @@ def handedness(scene: Scene, poses: Poses, name: str, imaging: Imaging) -> Hande
     mass across its principal axes: for a pelvis that is the one between left and right. Planes that change it hardly
     more are tried as well.
     """
-    images = []
-    for view in range(scene.views):
-        images += scene.there(scene.objects[name].shown_in, (view,))[:1]
+    images = scene.first_images(name)
     shown = [other for other in poses.camera1_from if all(scene.shown([other], kind) for kind, _ in images)]
 
     centre = reference_point_in_view(scene, poses, name, 0)

@@ -137,7 +137,7 @@ def images_of(scene: Scene, poses: Poses, name: str, imaging: Imaging) -> tuple[
     thing = replace(scene.objects[name], unsure=())
     scene = replace(scene, objects=scene.objects | {name: thing})
     body = _body(poses, name, thing.reference_point[None])
-    render, images = list(poses.camera1_from), _shown_in(scene, name)
+    render, images = list(poses.camera1_from), scene.first_images(name)
     try:
         return tuple(
             image_costs(scene, poses, (body,), render, images, level, _SIMILARITY, imaging=imaging) for level in _LEVELS
@@ -193,7 +193,7 @@ def gain_as_one(scene: Scene, poses: Poses, name: str, share: float, images: tup
 
 
 def _cut(scene: Scene, poses: Poses, name: str, share: float, images: tuple[ImageCosts, ...] | None) -> _Cut | None:
-    ends = _ends(scene, poses, name, share, _shown_in(scene, name))
+    ends = _ends(scene, poses, name, share, scene.first_images(name))
     if ends is None or images is None:
         return None
     return _Cut(name, (f"{name}, one end", f"{name}, the other"), ends, images)
@@ -241,14 +241,6 @@ def _at(point: Tensor, body: Body) -> Tensor:
     response = torch.eye(6, dtype=torch.float64)
     response[3:, :3] = -skew(point - body.centre) * torch.pi / 180  # ω × arm
     return response * body.scale * torch.tensor([180 / torch.pi] * 3 + [1.0] * 3, dtype=torch.float64)
-
-
-def _shown_in(scene: Scene, name: str) -> list[tuple[Kind, int]]:
-    """The first image, (kind, view), of every view that shows an object."""
-    images: list[tuple[Kind, int]] = []
-    for view in range(scene.views):
-        images += scene.there(scene.objects[name].shown_in, (view,))[:1]
-    return images
 
 
 def _ends(scene: Scene, poses: Poses, name: str, share: float, images: Sequence[tuple[Kind, int]]) -> _Ends | None:

@@ -1,0 +1,48 @@
+"""A CT that has not the shape of the patient, in words."""
+
+import math
+
+from femoreg_torch.case import Case
+from femoreg_torch.geometry import Poses
+from femoreg_torch.registration.evidence.ct_shape import Amount, ct_shape
+from femoreg_torch.registration.imaging import Imaging
+from femoreg_torch.registration.scene import Scene
+
+# LIMITS
+_MOST_STRETCHED, _MOST_SHEARED = 0.008, 0.012
+_SURE = 2.0
+
+
+def doubts_about_the_ct(case: Case, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
+    """How the images would stretch and shear the bones of the CT, in words, where that is much and sure."""
+    names = [name for name, thing in case.objects.items() if thing.model is None and name in poses.camera1_from]
+    if scene.anchor not in names:
+        return ()
+    found = ct_shape(scene, poses, names, imaging)
+    if found is None:
+        return ()
+    told = []
+    if _is_sure(found.stretch, _MOST_STRETCHED):
+        longer = "longer" if found.stretch.value > 0 else "shorter"
+        told.append(
+            f"the images show the bones {abs(found.stretch.value):.1%} {longer} across the slices than the CT has them "
+            f"(± {found.stretch.deviation:.1%}): check the slices' distance and the pixel size in the CT's header, and "
+            "whether the pictures' pixels are as wide and as high as the C-arm's file says"
+        )
+    for way, amount in (("from front to back", found.tilt), ("from side to side", found.slide)):
+        if _is_sure(amount, _MOST_SHEARED):
+            told.append(
+                f"the images show the bones sheared by {_degrees(amount.value):.1f}° {way} against the CT (± "
+                f"{_degrees(amount.deviation):.1f}°): was the CT's gantry tilted, without its program knowing, or did "
+                "the patient slide while it was taken?"
+            )
+    return tuple(told)
+
+
+def _is_sure(amount: Amount, most: float) -> bool:
+    """nan counts as that."""
+    return not (abs(amount.value) <= most or amount.sureness <= _SURE)
+
+
+def _degrees(shear: float) -> float:
+    return math.degrees(math.atan(abs(shear)))

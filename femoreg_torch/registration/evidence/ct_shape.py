@@ -1,0 +1,94 @@
+"""Has the CT the shape of the patient? The images are asked how its bones would have to be stretched and sheared.
+
+A CT whose slices lie farther apart than is told is too short. One whose gantry was tilted, and whose slices were
+stacked straight, is sheared, and so is one of a patient who slid while it was taken. Pictures whose pixels are not as
+wide and high as is told show a stretched patient. Bones of such a shape do not fit views from several sides, wherever
+bones and C-arms lie: all of these are refitted here. A change of size alone looks like another depth.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from femoreg_torch.errors import InputError
+from femoreg_torch.geometry import Poses
+from femoreg_torch.registration.costs import image_costs
+from femoreg_torch.registration.imaging import Imaging
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import mean_quadratic
+from femoreg_torch.registration.scene import Body, Scene, reference_point_in_view
+from femoreg_torch.similarity import GradNcc
+
+_LEVEL = Level(pixel_mm=3.1, step_mm=2.0)
+_SIMILARITY = GradNcc(patch_radius=5)
+_SCALE = (math.pi / 180,) * 3 + (1.0,) * 3  # rad and mm: one unit of a motion
+_LEAST_VIEWS = 2  # of one view any shape is another pose, nearly
+
+
+@dataclass(frozen=True)
+class Amount:
+    """By how much the images would deform bones in one way, and its standard deviation."""
+
+    value: float
+    deviation: float
+
+    @property
+    def sureness(self) -> float:
+        """The amount by its deviation."""
+        return abs(self.value) / self.deviation if self.deviation > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class CtShape:
+    """How the images would deform the bones of a CT. Each amount is asked by itself, the other two being zero."""
+
+    stretch: Amount  # along the slices' normal: 0.01 where they lie 1 % farther apart than the CT says
+    tilt: Amount  # by how much slices are shifted along their columns, from front to back, per distance between them
+    slide: Amount  # the same along their rows, from right to left
+
+
+def ct_shape(scene: Scene, poses: Poses, names: Sequence[str], imaging: Imaging) -> CtShape | None:
+    """What the images say of the shape of a CT, of which these objects are bones; the anchor is one of them.
+
+    A step of Newton along each way, all poses refitted, with the deviation of the sandwich estimator over tiles; see
+    `registration.evidence.covariance`. None where fewer than two views show the anchor, or leave nothing to compare.
+    """
+    images = scene.first_images(scene.anchor)
+    if len(images) < _LEAST_VIEWS:
+        return None
+    scale = torch.tensor(_SCALE, dtype=torch.float64)
+    carms = [view for _, view in images if view] if scene.camera_from_camera1 is None else []
+    bodies = (
+        *(Body((name,), 0, reference_point_in_view(scene, poses, name, 0), scale) for name in names),
+        *(Body((), view, reference_point_in_view(scene, poses, scene.anchor, view), scale) for view in carms),
+    )
+    try:
+        costs = image_costs(
+            scene, poses, bodies, list(poses.camera1_from), images, _LEVEL, _SIMILARITY, imaging=imaging
+        )
+    except InputError:  # what is saturated leaves nothing to compare
+        return None
+    thing = scene.objects[scene.anchor]
+    rates = _rates(thing.volume.lps_from_index, thing.reference_point)
+    n = len(costs.still)
+    model = mean_quadratic(costs.quadratics(costs.still, shapes=[dict.fromkeys(names, rate) for rate in rates]))
+    answer = -torch.linalg.pinv(model.hessian[:n, :n], hermitian=True) @ model.hessian[:n, n:]
+    curvature = (model.hessian[n:, n:] + model.hessian[n:, :n] @ answer).diagonal()
+    scores = model.scores[:, n:] + model.scores[:, :n] @ answer
+    values, deviations = -scores.sum(0) / curvature, scores.square().sum(0).sqrt() / curvature
+    return CtShape(*map(Amount, values.tolist(), deviations.tolist()))
+
+
+def _rates(lps_from_index: Tensor, centre: Tensor) -> list[Tensor]:
+    """Rates (4, 4) of stretch, tilt and slide of slices about a point (3,) mm, by which points in LPS move."""
+    rows, columns, normal = (lps_from_index[:3, :3] / lps_from_index[:3, :3].norm(dim=0)).T
+    found = []
+    for way in (normal, columns, rows):
+        linear = torch.outer(way, normal)
+        rate = torch.zeros(4, 4, dtype=torch.float64)
+        rate[:3, :3], rate[:3, 3] = linear, -linear @ centre
+        found.append(rate)
+    return found
