@@ -39,9 +39,9 @@ _FURTHER_SHIFT = 2.0  # times `shift_mm`, away from the range of the orbit
 # 2 to 31° (views were tilted towards head or feet by up to 20°), and this one within 1.0 to 3.7°.
 _TURN_STEP_DEG, _TILT_STEP_DEG, _MOST_TILT_DEG = 4.0, 8.0, 32.0
 _MOST_TURN_OF_TILTED_DEG = 60.0
-# A C-arm that swings, or whose base is turned between the views, turns its image: by 8°, a view 7° from view 1 was not
-# found without a roll.
-_ROLL_DEG, _MOST_TURN_OF_ROLLED_DEG = 8.0, 60.0
+# A C-arm that swings, or whose base is turned between the views, turns its image. A view 7° from view 1, rolled by 8°,
+# was not found without a roll, and one 30° from it, rolled by 15°, not with rolls of 8°.
+_ROLLS_DEG, _MOST_TURN_OF_ROLLED_DEG = (-16.0, -8.0, 8.0, 16.0), 60.0
 _COARSER_PIXEL, _COARSER_STEP = 1.25, 1.5  # times those of the level
 _ABOUT_DEG = (-6.0, 6.0, 7), (-3.0, 3.0, 5), (-4.0, 4.0, 3)  # about x, y and z of the camera: from, to, how many
 _ABOUT_SHIFT = 0.5  # times `shift_mm`
@@ -202,7 +202,7 @@ def rolled(scene: Scene, poses: Poses, half_range_deg: float) -> Tensor:
     middle = _middle(scene, poses)
     turned = _turned(scene, middle, orbit_angles(min(half_range_deg, _MOST_TURN_OF_ROLLED_DEG), _TURN_STEP_DEG))
     centres = transform_points(turned, middle[None])[:, 0]  # (N, 3)
-    rolls = (about_point(rigid(_about("z", math.radians(deg))), centres) for deg in (-_ROLL_DEG, _ROLL_DEG))
+    rolls = (about_point(rigid(_about("z", math.radians(deg))), centres) for deg in _ROLLS_DEG)
     return torch.cat([roll @ turned for roll in rolls])
 
 

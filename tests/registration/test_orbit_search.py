@@ -102,7 +102,7 @@ def test_a_tilted_view_is_found(turn_deg: float, tilt_deg: float, tilted_first: 
     assert offs[1] < 5
 
 
-@pytest.mark.parametrize(("turn_deg", "roll_deg"), [(7, -9), (-32, 8)])
+@pytest.mark.parametrize(("turn_deg", "roll_deg"), [(7, -9), (-32, 8), (25, 15)])
 def test_a_rolled_view_is_found(turn_deg: float, roll_deg: float) -> None:
     """Turned in its plane, as by a C-arm that swings, and a little beside where that leaves the pelvis."""
     poses = true_poses()

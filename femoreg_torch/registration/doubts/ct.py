@@ -8,9 +8,12 @@ from femoreg_torch.registration.evidence.ct_shape import Amount, ct_shape
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.scene import Scene
 
-# LIMITS
+# Right CTs seemed stretched by 0.3 % and sheared by 1.0 % at most, in 19 procedures and 21 faults of other kinds of
+# another simulator, but for small fields and dark views, by 1.4 deviations at most. Of the same: slices told 1 and 2 %
+# too near or too far, and pixels 1 % too wide or high, by 1.0 to 2.0 %; gantries tilted by 1.5 and 4°, 1.2 and 3.8°, by
+# 2.6 deviations. The deviation holds the misfit itself, so that more of it is no surer.
 _MOST_STRETCHED, _MOST_SHEARED = 0.008, 0.012
-_SURE = 2.0
+_SURE = 2.0  # deviations
 
 
 def doubts_about_the_ct(case: Case, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
@@ -23,11 +26,11 @@ def doubts_about_the_ct(case: Case, scene: Scene, poses: Poses, imaging: Imaging
         return ()
     told = []
     if _is_sure(found.stretch, _MOST_STRETCHED):
-        longer = "longer" if found.stretch.value > 0 else "shorter"
+        percent, deviation = 100 * abs(found.stretch.value), 100 * found.stretch.deviation
         told.append(
-            f"the images show the bones {abs(found.stretch.value):.1%} {longer} across the slices than the CT has them "
-            f"(± {found.stretch.deviation:.1%}): check the slices' distance and the pixel size in the CT's header, and "
-            "whether the pictures' pixels are as wide and as high as the C-arm's file says"
+            f"the images show the bones {percent:.1f} % {'longer' if found.stretch.value > 0 else 'shorter'} across the "
+            f"slices than the CT has them (± {deviation:.1f} %): check the slices' distance and the pixel size in the "
+            "CT's header, and whether the pictures' pixels are as wide and as high as the C-arm's file says"
         )
     for way, amount in (("from front to back", found.tilt), ("from side to side", found.slide)):
         if _is_sure(amount, _MOST_SHEARED):
