@@ -26,11 +26,12 @@ def doubts_about_the_ct(case: Case, scene: Scene, poses: Poses, imaging: Imaging
         return ()
     told = []
     if _is_sure(found.stretch, _MOST_STRETCHED):
+        longer = "longer" if found.stretch.value > 0 else "shorter"
         percent, deviation = 100 * abs(found.stretch.value), 100 * found.stretch.deviation
         told.append(
-            f"the images show the bones {percent:.1f} % {'longer' if found.stretch.value > 0 else 'shorter'} across the "
-            f"slices than the CT has them (± {deviation:.1f} %): check the slices' distance and the pixel size in the "
-            "CT's header, and whether the pictures' pixels are as wide and as high as the C-arm's file says"
+            f"the images show the bones {percent:.1f} % {longer} across the slices than the CT has them (± "
+            f"{deviation:.1f} %): check the slices' distance and the pixel size in the CT's header, and whether the "
+            "pictures' pixels are as wide and as high as the C-arm's file says"
         )
     for way, amount in (("from front to back", found.tilt), ("from side to side", found.slide)):
         if _is_sure(amount, _MOST_SHEARED):
@@ -43,8 +44,7 @@ def doubts_about_the_ct(case: Case, scene: Scene, poses: Poses, imaging: Imaging
 
 
 def _is_sure(amount: Amount, most: float) -> bool:
-    """nan counts as that."""
-    return not (abs(amount.value) <= most or amount.sureness <= _SURE)
+    return abs(amount.value) > most and amount.sureness > _SURE
 
 
 def _degrees(shear: float) -> float:

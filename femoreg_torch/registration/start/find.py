@@ -67,7 +67,7 @@ def find_start(
     found, or if the bones drawn at the pose cover those that the network sees by less than 80 % (Dice), or 90 % where
     more than a tenth of these lies beyond a CT that cuts them. Where fewer than four landmarks are of use or agree: if
     that cover is less than 90 %, or the rotation is left open by more than 5°; `among_views` 75 % and 16°, but for a CT
-    that cuts the bones; and without an outline.
+    that cuts the bones; and where there is no outline, or nothing of it that could be compared.
     """
     if detection.inverted:
         raise InputError(
@@ -120,6 +120,11 @@ def find_start(
     fit = refine_by_silhouette(
         outline, anatomy, pnp.camera_from_object, centre, pnp.covariance, bones, attenuation, camera, field
     )
+    if fit.overlap is None:
+        if too_few is not None:
+            raise too_few
+        check_rotation(pnp)
+        return Start(pnp.camera_from_object, pnp, used, None)
     if too_few is not None:
         alone = not among_views or fit.beyond > _MUCH_BEYOND
         least, most = (LEAST_OVERLAP, MOST_ROTATION_DEG) if alone else (_LEAST_AMONG_VIEWS, _MOST_DEG_AMONG_VIEWS)

@@ -27,6 +27,7 @@ _PIXEL_DEVIATION = 1.0
 _BAND_MM = 15.0  # on the detector, about the bone that is seen; further off a shutter may hide what is drawn
 _HIDDEN_MARGIN_MM = 3.0
 _BEYOND_MM, _BOX_MM = 200.0, 5.0  # a CT that cuts the bones: how far they may go on, and how finely that is drawn
+_ABOUT_CUT_MM = 40.0  # how far they may flare there
 _CUT = 0.3  # of the mask on the CT's border, from which a bone is cut there
 _STEP = 1e-5  # of a twist in standard deviations, for derivatives of the pose
 _SEARCH = LevenbergMarquardt(max_iterations=15, tol_x=0.02, tol_f=0.01, candidates=60, starts=3)
@@ -37,7 +38,7 @@ class SilhouetteFit:
     """A pose, and how far the bones drawn there cover those seen."""
 
     camera_from_ct: Tensor  # (4, 4) float64
-    overlap: float  # Dice in the band about the bone that is seen
+    overlap: float | None  # Dice in the band about the bone that is seen; None where nothing of that can be compared
     covariance: Tensor  # (6, 6) of (rotation in rad, translation in mm), camera axes, about the centre given
     beyond: float = 0.0  # share of the bone that is seen which lies beyond a CT that cuts it, and so was not compared
 
@@ -103,7 +104,8 @@ def refine_by_silhouette(
     best = _SEARCH.minimise(SmoothObjective(values, quadratic), 6, seed=0).delta
     inside = drawn(best[None])[0] > 0.5
     bone = target > 0.5
-    overlap = 2 * float((inside & bone).sum()) / max(float(inside.sum() + bone.sum()), 1.0)
+    hidden = len(target) == 0 and bool((probability > 0.5).any())
+    overlap = None if hidden else 2 * float((inside & bone).sum()) / max(float(inside.sum() + bone.sum()), 1.0)
     posterior = root @ torch.linalg.inv(quadratic(best).hessian) @ root.T
     return SilhouetteFit(poses(best[None])[0], overlap, posterior, left_out)
 
@@ -133,16 +135,26 @@ def _looked_at(
 def _cut_faces(mask: Volume) -> list[tuple[int, bool]]:
     """The faces of a CT that cut the bones of its mask: axis (0 is x of the index), and whether it is the last one."""
     faces = [(axis, last) for axis in range(3) for last in (False, True)]
-    return [(axis, last) for axis, last in faces if float(mask.data.select(2 - axis, -int(last)).max()) > _CUT]
+    return [face for face in faces if float(_on_face(mask, *face).max()) > _CUT]
+
+
+def _on_face(mask: Volume, axis: int, last: bool) -> Tensor:
+    """The mask on a face of its CT, (1, H, W), (D, 1, W) or (D, H, 1)."""
+    return mask.data.narrow(2 - axis, mask.data.shape[2 - axis] - 1 if last else 0, 1)
 
 
 def _beyond(mask: Volume, camera_from_ct: Tensor, camera: Camera) -> Tensor:
-    """Pixels (h, w) of a camera that see what lies beyond those faces of a CT that cut the bones of its mask."""
+    """Pixels (h, w) of a camera that see where bones go on beyond those faces of a CT that cut those of its mask.
+
+    That is before the cut and `_ABOUT_CUT_MM` about it: along a beam that meets the face, all of a picture lies beyond.
+    """
     spacing = torch.tensor(mask.spacing_mm, dtype=torch.float64)
     size = torch.tensor(mask.data.shape).flip(0) * spacing
     found = torch.zeros(camera.shape, dtype=torch.bool, device=mask.data.device)
     for axis, last in _cut_faces(mask):
-        extent, first = size.clone(), torch.zeros(3, dtype=torch.float64)  # mm along the axes, from the CT's corner
+        cut = (_on_face(mask, axis, last) > _CUT).nonzero().flip(1).cpu()  # (N, 3) x, y, z
+        first = (cut.amin(0) * spacing - _ABOUT_CUT_MM).clamp_min(0)  # mm along the axes, from the CT's corner
+        extent = torch.minimum((cut.amax(0) + 1) * spacing + _ABOUT_CUT_MM, size) - first
         extent[axis], first[axis] = _BEYOND_MM, size[axis] if last else -_BEYOND_MM
         counts = (extent / _BOX_MM).ceil()
         affine = mask.lps_from_index.clone()

@@ -91,6 +91,7 @@ def test_a_start_far_off_is_brought_near(seen: Tensor, shutter: int) -> None:
     turned, depth = errors(fit.camera_from_ct)
     assert turned < 2.5  # 0.3 mm of the outline, a tenth of a pixel
     assert depth < 8.0
+    assert fit.overlap is not None
     assert fit.overlap > 0.94
     assert (fit.covariance.diagonal() < covariance.diagonal()).all()
 
@@ -104,16 +105,34 @@ def test_what_the_image_shows_beyond_a_short_ct_is_not_compared(seen: Tensor) ->
     bones = Segmentation(seen, network_camera(CAMERA).downsampled(2))
     image = torch.rand(CAMERA.shape, generator=torch.Generator().manual_seed(1))
     fit = refine_by_silhouette(cut, HIP, off_by(5.0, 15.0), CENTRE, covariance, bones, image, CAMERA)
+    assert fit.overlap is not None
     assert fit.overlap > 0.94
     assert errors(fit.camera_from_ct)[0] < 3.5
     narrow = Volume(labels(2.0, 0.7).data[:65], whole.lps_from_index)
     stretched = outline_of(BoneLabels(narrow, {"hip_left": 1, "hip_right": 2}), HIP)
     assert stretched is not None
     other = refine_by_silhouette(stretched, HIP, TRUTH, CENTRE, covariance, bones, image, CAMERA)
+    assert other.overlap is not None
     assert other.overlap < LEAST_OVERLAP  # which is asked for of bones that a CT cuts
     assert fit.beyond > 0.3
     whole_fit = refine_by_silhouette(outline(2.0), HIP, TRUTH, CENTRE, covariance, bones, image, CAMERA)
     assert whole_fit.beyond == 0
+
+
+def test_a_ct_that_is_cut_in_front_leaves_most_to_compare(seen: Tensor) -> None:
+    """All of the picture lies beyond that face, but the bones are cut at a few places there."""
+    whole = labels(2.0)
+    behind = axis_aligned((2.0,) * 3, (-120.0, -8.0, -120.0))
+    cut = outline_of(BoneLabels(Volume(whole.data[:, 56:], behind), {"hip_left": 1, "hip_right": 2}), HIP)
+    assert cut is not None
+    covariance = torch.diag(torch.tensor([0.08, 0.08, 0.04, 3, 3, 20], dtype=torch.float64) ** 2)
+    bones = Segmentation(seen, network_camera(CAMERA).downsampled(2))
+    image = torch.rand(CAMERA.shape, generator=torch.Generator().manual_seed(1))
+    fit = refine_by_silhouette(cut, HIP, off_by(5.0, 15.0), CENTRE, covariance, bones, image, CAMERA)
+    assert 0.1 < fit.beyond < 0.8
+    assert fit.overlap is not None
+    assert fit.overlap > 0.94
+    assert errors(fit.camera_from_ct)[0] < 3.5
 
 
 def detection(seen: Tensor, points: Tensor) -> Detection:
@@ -134,6 +153,19 @@ def test_another_patient_is_refused(seen: Tensor) -> None:
     blind = replace(detection(seen, points), segmentation=torch.zeros_like(seen))
     with pytest.raises(InputError, match="agree by 0% only"):
         find_start(landmarks, blind, image, CAMERA, outline(2.0), HIP)
+
+
+def test_where_nothing_can_be_compared_landmarks_start_it_alone(seen: Tensor) -> None:
+    """Of an image that a shutter covers nearly, as it seems; few landmarks are not enough then."""
+    points = torch.randn(14, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 40
+    landmarks = dict(zip(HIP.landmark_names, points, strict=True))
+    covered = torch.full(CAMERA.shape, 0.5)
+    found = find_start(landmarks, detection(seen, points), covered, CAMERA, outline(2.0), HIP)
+    assert found.overlap is None
+    assert errors(found.camera_from_ct)[0] < 0.5
+    few = replace(detection(seen, points), visible=torch.arange(14) < 3)
+    with pytest.raises(InputError, match="3 usable landmarks found"):
+        find_start(landmarks, few, covered, CAMERA, outline(2.0), HIP, among_views=True)
 
 
 @pytest.mark.parametrize("count", [1, 3])
