@@ -122,8 +122,8 @@ def test_what_the_image_shows_beyond_a_short_ct_is_not_compared(seen: Tensor) ->
 def test_a_ct_that_is_cut_in_front_leaves_most_to_compare(seen: Tensor) -> None:
     """All of the picture lies beyond that face, but the bones are cut at a few places there."""
     whole = labels(2.0)
-    behind = axis_aligned((2.0,) * 3, (-120.0, -8.0, -120.0))
-    cut = outline_of(BoneLabels(Volume(whole.data[:, 56:], behind), {"hip_left": 1, "hip_right": 2}), HIP)
+    behind = axis_aligned((2.0,) * 3, (-120.0, 0.0, -120.0))
+    cut = outline_of(BoneLabels(Volume(whole.data[:, 60:], behind), {"hip_left": 1, "hip_right": 2}), HIP)
     assert cut is not None
     covariance = torch.diag(torch.tensor([0.08, 0.08, 0.04, 3, 3, 20], dtype=torch.float64) ** 2)
     bones = Segmentation(seen, network_camera(CAMERA).downsampled(2))
