@@ -59,6 +59,11 @@ class CohortSettings:
             seed=SEEDS,
             devices=(0, 100_000),
         )
+        if both := sorted(set(self.patient_seeds) & set(self.validation_seeds)):
+            raise InputError(
+                f"cohort: patient {both[0]} is among patient_seeds and validation_seeds. Whom it learns from cannot "
+                "tell how well it does."
+            )
 
 
 @dataclass(frozen=True)

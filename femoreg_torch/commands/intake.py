@@ -124,9 +124,9 @@ def new_case(
     material: str | None = None,
     hu: float | None = None,
     guide: str | None = None,
-    before_entry_mm: float = 0.0,
-    turned_deg: float = 0.0,
-    in_front_mm: float = 0.0,
+    before_entry_mm: float | None = None,
+    turned_deg: float | None = None,
+    in_front_mm: float | None = None,
     device_transform: Path | None = None,
     images: tuple[Path, ...] = (),
     device_images: tuple[Path, ...] = (),
@@ -162,9 +162,9 @@ def new_case(
         hu: HU of the device, in place of a material; 5000 if neither is given.
         guide: Which way the guide points at its nominal pose: `along the planned path` (the default), `from the side`,
             `from the front`, `from the back`, `from above`, `from below` or `from the middle`.
-        before_entry_mm: How far before the entry point its tip stands; negative: past it.
-        turned_deg: By how much it is turned about the guide, by the right-hand rule about base → tip.
-        in_front_mm: How far all of it stands in front of that place, towards the front of the patient.
+        before_entry_mm: How far before the entry point its tip stands (by default 0); negative: past it.
+        turned_deg: By how much it is turned about the guide (by default 0), by the right-hand rule about base → tip.
+        in_front_mm: How far all of it stands in front of that place (by default 0), towards the front of the patient.
         device_transform: In place of these: a transform of 3D Slicer under which the device stands right in the CT.
         images: Images without the device, one for each C-arm pose, in order; or a folder of them.
         device_images: Images with the device, in the same order; or a folder of them.
@@ -187,6 +187,7 @@ def new_case(
     from rich.markup import escape
 
     from femoreg_torch.commands.asking import ask_for_missing
+    from femoreg_torch.commands.telling import tell
     from femoreg_torch.intake import NewCase, make_case
 
     given = NewCase(
@@ -220,6 +221,10 @@ def new_case(
     console = Console(soft_wrap=True)
     if sys.stdin.isatty():
         given = ask_for_missing(given, console)
-    for note in make_case(out, given):
+    with console.status("making the case"):
+        notes, warnings = make_case(out, given)
+    for note in notes:
         console.print(f"  {escape(note)}", highlight=False)
+    for warning in warnings:
+        tell(console, "Warning", warning)
     console.print(f"Case written to {escape(str(out))}. Look at it with `femoreg check`, then `femoreg register`.")

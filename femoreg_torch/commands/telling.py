@@ -50,7 +50,7 @@ def tell_device(console: Console, name: DeviceName) -> torch.device:
 def tell(console: Console, what: str, words: str) -> None:
     """A warning or a note, as a sentence."""
     stop = "" if words.endswith((".", "?", "!")) else "."
-    console.print(f"[yellow]{what}:[/] {escape(words)}{stop}", highlight=False)
+    console.print(f"[yellow]{what}:[/] {escape(words)}{stop}", highlight=False, soft_wrap=not console.is_terminal)
 
 
 def tell_verdict(console: Console, result: Result) -> None:
@@ -61,6 +61,6 @@ def tell_verdict(console: Console, result: Result) -> None:
     else:
         console.print("[bold red]Do not trust this registration:[/]")
         for reason in verdict.reasons:
-            console.print(f"  {escape(reason)}")
+            console.print(f"  {escape(reason)}", soft_wrap=not console.is_terminal)  # a log is searched by lines
     for note in result.skipped:
         tell(console, "Note", note)

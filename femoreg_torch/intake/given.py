@@ -1,5 +1,6 @@
 """What a new case is made of, and how its files come into it."""
 
+import re
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,9 +28,9 @@ class NewCase:
     material: str | None = None
     hu: float | None = None
     guide: str | None = None
-    before_entry_mm: float = 0.0
-    turned_deg: float = 0.0
-    in_front_mm: float = 0.0
+    before_entry_mm: float | None = None
+    turned_deg: float | None = None
+    in_front_mm: float | None = None
     device_transform: Path | None = None
     images: tuple[Path, ...] = ()
     device_images: tuple[Path, ...] = ()
@@ -52,7 +53,7 @@ def copied(path: Path, folder: Path, stem: str) -> str:
         write_image(folder / f"{stem}.mha", read_itk(path))
         return f"{stem}.mha"
     suffix = next((s for s in (".seg.nrrd", ".nii.gz") if path.name.lower().endswith(s)), path.suffix.lower())
-    name = stem + (suffix or ".dcm")
+    name = stem + (".dcm" if re.fullmatch(r"\.?\d*", suffix) else suffix)  # scanners end names with numbers
     shutil.copyfile(path, folder / name)
     return name
 

@@ -1,5 +1,6 @@
 """Which ids of a user's label map are which bones: by a table's name, or by the names of its parts."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import torch
 
 from femoreg_torch.anatomy import HIP, LabelTable, bone_of_name, fitting_tables, label_table, label_table_names
 from femoreg_torch.errors import InputError
+from femoreg_torch.files import read_json
 from femoreg_torch.intake.check_anatomy import some_of
 from femoreg_torch.volume import has_names, read_label_map, segment_names
 
@@ -23,6 +25,8 @@ def table_of_map(labels: Path, bones: str | None, usual: str | None = None) -> t
         return label_table(bones), []
     if has_names(labels):
         return _by_names(labels)
+    if (own := _told_beside(labels)) is not None:
+        return label_table(own), []
     there = [n for n in torch.unique(read_label_map(labels).data).tolist() if n]
     if usual is not None and set(there) <= {n for ids in label_table(usual).values() for n in ids}:
         return label_table(usual), []
@@ -34,6 +38,15 @@ def table_of_map(labels: Path, bones: str | None, usual: str | None = None) -> t
         f"--bones: is missing, and {labels.name} does not name its bones. Say which table its ids are of: "
         f"{', '.join(label_table_names())}, or a YAML file ({hint})."
     )
+
+
+def _told_beside(labels: Path) -> str | None:
+    """The table that `femoreg segment` names in the JSON file beside its map; None where none is of this map."""
+    beside = labels.with_name(re.sub(r"\.nii(\.gz)?$|\.nrrd$|\.mha$", "", labels.name, flags=re.IGNORECASE) + ".json")
+    if labels.is_dir() or not beside.is_file():
+        return None
+    content = read_json(beside)
+    return str(content["table"]) if content.get("labels") == labels.name and "table" in content else None
 
 
 def _by_names(labels: Path) -> tuple[LabelTable, list[str]]:

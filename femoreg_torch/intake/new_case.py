@@ -1,8 +1,10 @@
 """A case folder made of the files that scanner, 3D Slicer, TotalSegmentator and C-arm leave: `femoreg new-case`."""
 
 import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import yaml
@@ -43,7 +45,9 @@ from femoreg_torch.volume import (
     read_path_points,
     write_landmarks,
 )
+from femoreg_torch.volume.materials import material_hu
 
+T = TypeVar("T")
 NEEDED = ("ct", "labels", "landmarks", "plan", "images")
 _OWN_TABLE = "femoreg"  # of label maps that are made here
 _SAID_BY = {  # what a problem asks to write into `case.yaml`, and the options that write it
@@ -55,8 +59,8 @@ _SAID_BY = {  # what a problem asks to write into `case.yaml`, and the options t
 _DEVICE_HU = 5000.0  # of the paper's device
 
 
-def make_case(out: Path, given: NewCase) -> list[str]:
-    """Make the case folder `out`, which must not be there yet, and return what was assumed or done, in words.
+def make_case(out: Path, given: NewCase) -> tuple[list[str], tuple[str, ...]]:
+    """Make the case folder `out`, which must not be there yet; return what was assumed or done, and warnings, in words.
 
     Raises `InputError` that lists everything that is missing or wrong; then nothing is written.
     """
@@ -76,8 +80,7 @@ def make_case(out: Path, given: NewCase) -> list[str]:
             flags = [flag for key, flag in _SAID_BY.items() if any(key in problem for problem in told)]
             hint = f" To new-case, this is said by {', '.join(flags)}." if flags else ""
             raise InputError(_together(f"{out}: not written", told) + hint)
-        notes += checked.warnings
-    return notes
+    return notes, checked.warnings
 
 
 def _sources(content: dict[str, Any], given: NewCase) -> dict[str, Path]:
@@ -86,6 +89,9 @@ def _sources(content: dict[str, Any], given: NewCase) -> dict[str, Path]:
     sources = {view["anatomy"]: path for view, path in zip(views, image_files(given.images, []), strict=True)}
     if given.device is not None:
         sources[content[DEVICE]["model"]] = given.device
+    if str(content["carm"]).endswith((".yaml", ".yml")):
+        sources[content["carm"]] = Path(str(given.carm))
+    if given.device is not None:
         sources |= {view[DEVICE]: path for view, path in zip(views, image_files(given.device_images, []), strict=False)}
     return sources
 
@@ -120,8 +126,12 @@ def _check_given(given: NewCase) -> None:
         told.append("--device is missing, the model that --device-images or --device-points are of")
     if given.material is not None and given.hu is not None:
         told.append("--material and --hu are both given: keep one")
-    if given.guide is not None and given.device_transform is not None:
-        told.append("--guide and --device-transform are both given: keep one")
+    by_words = ("guide", "before_entry_mm", "turned_deg", "in_front_mm")
+    told += [
+        f"--{name.replace('_', '-')} and --device-transform are both given: keep one"
+        for name in by_words
+        if given.device_transform is not None and getattr(given, name) is not None
+    ]
     if told:
         raise InputError(_together("new-case", told))
 
@@ -136,10 +146,30 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     """What `case.yaml` is to hold; the files it names are copied into `folder`."""
     assert given.ct is not None  # seen by `_check_given`, as the others
     assert given.plan is not None
-    ct, told = read_ct_told(given.ct, given.series)
+    failed: list[str] = []
+
+    def tried(read: Callable[[], T]) -> T | None:
+        """What was read, or None; what is wrong is told at once with all else that is."""
+        try:
+            return read()
+        except InputError as error:
+            failed.append(str(error))
+            return None
+
+    read_ct = tried(partial(read_ct_told, given.ct, given.series))
+    given_landmarks = None if given.landmarks is None else tried(partial(read_landmarks, given.landmarks))
+    path = tried(partial(read_path_points, given.plan))
+    device = None if given.device is None else tried(partial(_device, folder, given, notes))
+    images, device_images = image_files(given.images, notes), image_files(given.device_images, notes)
+    notes += tried(partial(notes_on_patients, given, images, device_images)) or []
+    carm = tried(partial(carm_content, folder, given, images[0], notes))
+    display = tried(partial(display_of_images, given, images, notes))
+    views = tried(partial(placed_views, folder, images, device_images, given, notes))
+    if failed or read_ct is None or path is None:
+        raise InputError(_together("not written", failed))
+    ct, told = read_ct
+    entry_point, target = path
     notes += told
-    given_landmarks = None if given.landmarks is None else read_landmarks(given.landmarks)
-    entry_point, target = read_path_points(given.plan)
     if given.labels is None:
         bones, (labels_name, labels) = label_table(_OWN_TABLE), segmented_labels(folder, ct, notes)
     else:
@@ -154,24 +184,20 @@ def _content(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
             "missing. Place it in 3D Slicer, in the centre of the head."
         )
     write_landmarks(folder / "landmarks.json", landmarks)
-    content: dict[str, Any] = {
+    if target is None:
+        notes.append("the path's target is the femoral head, as the plan has no other")
+    return {
         "version": VERSIONS[-1],
         "template": TEMPLATE,
         "side": side,
         "ct": {"image": placed_ct(folder, given.ct, ct), "labels": labels_name, "bones": told_bones(bones)},
         "landmarks": "landmarks.json",
         "plan": {"entry_point": entry_point, "target": "FH" if target is None else target},
+        **({} if device is None else {DEVICE: device}),
+        "carm": carm,
+        **(display or {}),
+        "views": views,
     }
-    if target is None:
-        notes.append("the path's target is the femoral head, as the plan has no other")
-    if given.device is not None:
-        content[DEVICE] = _device(folder, given, notes)
-    images, device_images = image_files(given.images, notes), image_files(given.device_images, notes)
-    notes += notes_on_patients(given, images, device_images)
-    content["carm"] = carm_content(folder, given, images[0], notes)
-    content |= display_of_images(given, images, notes)
-    content["views"] = placed_views(folder, images, device_images, given, notes)
-    return content
 
 
 def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
@@ -190,6 +216,7 @@ def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
         notes.append("errors of the device are told at the middle of its box, as no point `center` is given")
     content: dict[str, Any] = {"model": copied(given.device, folder, DEVICE)}
     if given.material is not None:
+        material_hu(given.material)  # raises what is wrong with the name
         content["material"] = given.material
     else:
         content["hu"] = _DEVICE_HU if given.hu is None else given.hu
@@ -198,8 +225,12 @@ def _device(folder: Path, given: NewCase, notes: list[str]) -> dict[str, Any]:
     content["points"] = points
     if given.device_transform is not None:
         return content | {f"{FEMUR}_from_{DEVICE}": read_itk_transform(given.device_transform)}
-    place = NominalPlace(given.guide or ALONG_PATH, given.before_entry_mm, given.turned_deg, given.in_front_mm)
+    before, turned, front = given.before_entry_mm or 0.0, given.turned_deg or 0.0, given.in_front_mm or 0.0
+    place = NominalPlace(given.guide or ALONG_PATH, before, turned, front)
     if given.guide is None:
-        mm, where = abs(given.before_entry_mm), "past" if given.before_entry_mm < 0 else "before"
-        notes.append(f"the device starts {ALONG_PATH}, its tip {mm:g} mm {where} the entry point")
+        where = "past" if before < 0 else "before"
+        note = f"the device starts {ALONG_PATH}, its tip {abs(before):g} mm {where} the entry point"
+        note += f", turned by {turned:g}°" if turned else ""
+        note += f", and all of it {front:g} mm in front of there" if front else ""
+        notes.append(note)
     return content | {"start": vars(place)}

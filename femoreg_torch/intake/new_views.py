@@ -16,6 +16,7 @@ from femoreg_torch.fluoro import (
     other_patient,
     read_header,
 )
+from femoreg_torch.geometry import load_carm
 from femoreg_torch.intake.given import NewCase, copied, short_name
 from femoreg_torch.paths import why_unreadable
 from femoreg_torch.volume import patient_of
@@ -89,7 +90,9 @@ def carm_content(folder: Path, given: NewCase, image: Path, notes: list[str]) ->
         if given.carm.endswith((".yaml", ".yml")):
             if (why := why_unreadable(Path(given.carm))) is not None:
                 raise InputError(f"--carm: {given.carm}: {why}")
+            load_carm(given.carm)  # raises what is wrong in it
             return copied(Path(given.carm), folder, "carm")
+        load_carm(given.carm)
         return given.carm
     if not is_dicom(image):
         raise InputError(f"--carm: is missing, and {image.name} is no DICOM file whose tags could say it.")

@@ -99,9 +99,16 @@ def hardly_shown(scene: Scene, poses: Poses, names: Sequence[str]) -> tuple[str,
         points = transform_points(poses.camera_from(name)[0] @ volume.lps_from_index, inside)
         share = float(_in_picture(project_points(scene.carm.camera, points), scene.carm.camera).double().mean())
         if share == 0:
+            beside = scene.objects[name].start.beside
+            advice = (
+                "The start pose must take points of its space to camera 1: is this the inverse?"
+                if beside is None
+                else f"It starts beside the {beside}: check `before_entry_mm`, `in_front_mm` and the guide of its "
+                "`start`, or whether its transform takes points of its space to the CT"
+            )
             found.append(
-                f"{name}: where it is meant to stand, nothing of it lies in the picture of view 1. The start pose "
-                "must take points of its space to camera 1: is this the inverse?"
+                f"{name}: where it is meant to stand, nothing of it lies in the picture of view 1; its middle lies "
+                f"{_where(project_points(scene.carm.camera, points.mean(0)[None])[0], scene.carm.camera)}. {advice}"
             )
         elif share < _LEAST_SHOWN:
             found.append(
@@ -109,6 +116,15 @@ def hardly_shown(scene: Scene, poses: Poses, names: Sequence[str]) -> tuple[str,
                 "show no more, its turn about a round guide stays open: take views that show more of it"
             )
     return tuple(found)
+
+
+def _where(pixel: Tensor, camera: Camera) -> str:
+    """Where a pixel (2,), column and row, lies beside the picture, in words."""
+    column, row = pixel.tolist()
+    height, width = camera.shape
+    sides = {"left of it": -column, "right of it": column - width, "above it": -row, "below it": row - height}
+    side = max(sides, key=lambda each: sides[each])
+    return f"{sides[side]:.0f} pixels {side}"
 
 
 def _panel(case: Case, scene: Scene, poses: Poses, kind: str) -> Picture:

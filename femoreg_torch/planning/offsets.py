@@ -116,10 +116,13 @@ def normal_moves(mean: Array, covariance: Array, draws: int, seed: int) -> Array
     """
     mean, covariance = np.asarray(mean, float), np.asarray(covariance, float)
     count = len(covariance)
-    if count not in (3, 6) or covariance.shape != (count, count) or not np.isfinite(covariance).all():
+    if count not in (3, 6) or covariance.shape != (count, count):
+        found = " × ".join(map(str, covariance.shape)) or "one number"
         raise InputError(
-            f"covariance: 3 × 3 (mm², LPS) or 6 × 6 numbers (mm, then degrees) were expected, found {covariance.shape}."
+            f"covariance: 3 × 3 (mm², LPS) or 6 × 6 numbers (mm, then degrees) were expected, found {found}."
         )
+    if not np.isfinite(covariance).all():
+        raise InputError("covariance: holds a value that is infinite or no number.")
     if mean.shape != (count,) or not np.isfinite(mean).all():
         raise InputError(f"mean: {count} numbers were expected, as many as the covariance has rows, found {mean.size}.")
     if not np.allclose(covariance, covariance.T) or np.linalg.eigvalsh(covariance).min() < -1e-9:
@@ -140,12 +143,23 @@ def read_covariance(file: File) -> Array:
         return _covariance_of(read_result(file.parent), file)
     if file.suffix.lower() == ".json" and file.exists():
         raise InputError(f"{file}: a result is read by its name. Call it {RESULT_NAME}, in a folder of its own.")
-    text = read_bytes(file, _MOST_BYTES).decode("utf-8", "replace")
-    rows = [line.replace(",", " ").split() for line in text.splitlines() if line.strip()]
-    try:
-        return np.array(rows, float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{file}: rows of numbers, all of one length, were expected.") from error
+    text = read_bytes(file, _MOST_BYTES).decode("utf-8-sig", "replace")
+    rows: list[list[float]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        cells = line.replace(",", " ").split()
+        try:
+            values = [float(cell) for cell in cells]
+        except ValueError as error:
+            raise InputError(
+                f"{file}, line {number}: numbers were expected, found {shortened(line.strip())}."
+            ) from error
+        if rows and values and len(values) != len(rows[0]):
+            raise InputError(
+                f"{file}, line {number}: {len(values)} numbers were found, and {len(rows[0])} in the lines before. "
+                "Write decimal points, and spaces or commas between numbers."
+            )
+        rows += [values] if values else []
+    return np.array(rows, float)
 
 
 def check_run(file: File, case: Case, side: Side) -> None:

@@ -63,6 +63,7 @@ NUMBERS = (
 )
 _NOT_NEGATIVE = {*(q.column for q in QUANTITIES), *_MISS, *SIGMAS}
 _NOT_TEXT = ("number", "seed", "trusted")
+_GREATEST = 1e9  # of a value of a run
 
 
 def read_rows(path: Path) -> pd.DataFrame:
@@ -93,24 +94,42 @@ def checked_rows(rows: pd.DataFrame, where: str | Path) -> pd.DataFrame:
     numbers = pd.to_numeric(rows["number"].where(rows["number"].map(is_scalar)), errors="coerce")
     if not (numbers % 1 == 0).all():
         raise InputError(f"{where}, column number: whole numbers were expected, one for each procedure.")
+    verdicts = [c for c in rows if c == "trusted" or c in {f"{name}_trusted" for name in OBJECTS}]
+    for column in verdicts:
+        if words := [value for value in rows[column] if isinstance(value, str)]:
+            raise InputError(f"{where}, column {column}: true or false was expected, found {shortened(words[0])}.")
     rows = rows.copy()
     for column in [c for c in rows if is_object_dtype(rows[c])]:  # columns of text hold nothing else
         rows[column] = rows[column].map(lambda value: value if is_scalar(value) else _text(value))
     for column in [c for c in (*IDENTITY, *OUTCOME, ASKED) if c in rows and c not in _NOT_TEXT]:
         rows[column] = rows[column].astype(object).where(rows[column].notna(), "").map(_text)
-    for column in [c for c in rows if c == "trusted" or c in {f"{name}_trusted" for name in OBJECTS}]:
+    for column in verdicts:
         rows[column] = rows[column].map(_is_true).astype(bool)  # what is not known to be trusted is not
     rows["trusted"] &= rows["status"].eq(DONE)
     for column in [c for c in rows if c in NUMBERS or c.startswith((SECONDS, EVALUATIONS))]:
-        try:
-            rows[column] = pd.to_numeric(rows[column]).astype(float)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{where}, column {column}: numbers were expected ({shortened(error)}).") from error
-        if np.isinf(rows[column]).any():
-            raise InputError(f"{where}, column {column}: holds an infinite number.")
+        rows[column] = _numbers(rows, column, where)
         if column in _NOT_NEGATIVE and (rows[column] < 0).any():
             raise InputError(f"{where}, column {column}: an error or a deviation cannot be below 0.")
+    keys = [*IDENTITY, ROUND] if ROUND in rows else [*IDENTITY]
+    if (twice := rows.duplicated(keys)).any():
+        one = rows[twice].iloc[0]
+        raise InputError(
+            f"{where}: run {one['number']} of condition {shortened(one['condition'])} stands there twice, with the "
+            "same settings. Keep one."
+        )
     return rows.sort_values(["condition", "number"], kind="stable", ignore_index=True)
+
+
+def _numbers(rows: pd.DataFrame, column: str, where: str | Path) -> "pd.Series[float]":
+    """A column as numbers. Raises `InputError` with the run whose value is none, or far too large for any run."""
+    given = rows[column].map(lambda value: value if is_scalar(value) else str(value))
+    found = pd.to_numeric(given, errors="coerce").astype(float)
+    wrong = (found.isna() & given.notna()) | (found.abs() > _GREATEST)
+    if wrong.any():
+        run = rows["number"][wrong].iloc[0]
+        what = "an infinite number" if np.isinf(found[wrong].iloc[0]) else shortened(given[wrong].iloc[0])
+        raise InputError(f"{where}, column {column}: numbers were expected, and run {run} has {what}.")
+    return found
 
 
 def _is_true(value: object) -> bool:

@@ -190,7 +190,7 @@ def _linked(path: Path, folder: Path) -> Path:
         shutil.copytree(path, target)
         return target
     try:
-        os.link(path, target)
+        os.link(path.resolve(), target)  # of a link, what it leads to
     except OSError:  # another file system, or one without hard links
         shutil.copyfile(path, target)
     return target

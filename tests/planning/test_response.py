@@ -136,7 +136,7 @@ def test_random_moves_have_their_mean_and_covariance() -> None:
         (np.zeros(3), np.array([[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]), "is not symmetric"),
         (np.zeros(3), np.eye(4), "3 × 3"),
         (np.zeros(6), np.eye(3), "mean: 3 numbers were expected"),
-        (np.zeros(3), np.full((3, 3), np.nan), "numbers"),
+        (np.zeros(3), np.full((3, 3), np.nan), "infinite or no number"),
     ],
 )
 def test_what_is_no_covariance_is_told(mean: np.ndarray, covariance: np.ndarray, told: str) -> None:
@@ -148,11 +148,18 @@ def test_covariances_are_read_from_text_and_from_results(tmp_path: File) -> None
     wanted = np.diag([1.0, 2.0, 3.0])
     (tmp_path / "a.csv").write_text("1, 0, 0\n0,2,0\n0,0,3\n", encoding="utf-8")
     (tmp_path / "a.txt").write_text("1 0 0\n0 2 0\n\n0 0 3\n", encoding="utf-8")
+    (tmp_path / "excel.csv").write_bytes(b"\xef\xbb\xbf1,0,0\r\n0,2,0\r\n0,0,3\r\n")
+    (tmp_path / "commas.csv").write_text("1,0 0,5 0\n0 2 0\n0 0 3\n", encoding="utf-8")
     (tmp_path / "bad.txt").write_text("1 0 0\n0 two 0\n", encoding="utf-8")
-    for name in ("a.csv", "a.txt"):
+    for name in ("a.csv", "a.txt", "excel.csv"):
         np.testing.assert_array_equal(read_covariance(tmp_path / name), wanted)
     (tmp_path / "other.json").write_text("{}", encoding="utf-8")
-    bad = {"other.json": "a result is read by its name", "bad.txt": "rows of numbers", "no.txt": "no such file"}
+    bad = {
+        "other.json": "a result is read by its name",
+        "bad.txt": "line 2: numbers were expected, found '0 two 0'",
+        "no.txt": "no such file",
+    }
+    bad["commas.csv"] = "line 2: 3 numbers were found, and 5 in the lines before"
     for name, told in bad.items():
         with pytest.raises(InputError, match=told):
             read_covariance(tmp_path / name)

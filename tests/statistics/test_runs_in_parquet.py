@@ -76,8 +76,10 @@ def test_what_is_not_known_to_be_trusted_is_not() -> None:
         ("number", None, "column number: whole numbers"),
         ("femur_mm", [1, 2], "column femur_mm: numbers were expected"),
         ("femur_mm", "far", "column femur_mm: numbers were expected"),
+        ("femur_mm", 1e300, "column femur_mm: numbers were expected, and run 1 has 1e\\+300"),
+        ("trusted", "yes", "column trusted: true or false was expected, found 'yes'"),
         ("femur_mm", -1.0, "column femur_mm: an error or a deviation cannot be below 0"),
-        ("femur_mm", float("inf"), "column femur_mm: holds an infinite number"),
+        ("femur_mm", float("inf"), "column femur_mm: numbers were expected, and run 1 has an infinite number"),
     ],
 )
 def test_columns_of_other_things(column: str, value: object, says: str, tmp_path: Path) -> None:
@@ -87,6 +89,12 @@ def test_columns_of_other_things(column: str, value: object, says: str, tmp_path
     with pytest.raises(InputError, match=says) as raised:
         read_rows(tmp_path / "runs.parquet")
     assert "\n" not in str(raised.value)
+
+
+def test_a_run_that_stands_there_twice_is_told() -> None:
+    rows = made_up(4)
+    with pytest.raises(InputError, match="run 2 of condition 'plain' stands there twice"):
+        checked_rows(pd.concat([rows, rows[rows["number"].eq(2)]]), "here")
 
 
 @pytest.mark.parametrize("column", ["pelvis_trusted", "trusted", "reasons", "varied_bed", "host", "version_torch"])
