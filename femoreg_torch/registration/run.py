@@ -163,7 +163,11 @@ def register_scene(
     covariance = final_covariance(scene, outcome.poses, plan.imaging)
     quality = assess(scene, outcome.poses, Limits(), plan.imaging, outcome.trace, covariance)
     against = (
-        *turned_from_where_told(plan.steps, outcome.trace),
+        *turned_from_where_told(
+            plan.steps,
+            outcome.trace,
+            {name: each.displacement and each.displacement[0] for name, each in quality.items()},
+        ),
         *doubts(case, told, scene, outcome.poses, covariance, plan.imaging, Limits()),
     )
     done = time.perf_counter()

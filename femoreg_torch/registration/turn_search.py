@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -135,10 +135,14 @@ def _guide(scene: Scene, poses: Poses, name: str) -> tuple[Body, Tensor]:
     return Body((name,), 0, base, turning), (tip - base) / (tip - base).norm()
 
 
-def turned_from_where_told(steps: Sequence[Step], trace: Sequence[StageRecord]) -> tuple[str, ...]:
+def turned_from_where_told(
+    steps: Sequence[Step], trace: Sequence[StageRecord], found_deg: Mapping[str, float | None]
+) -> tuple[str, ...]:
     """Tools that a search found turned about their guide, in words: the nominal pose is wrong, or the model mirrored.
 
     A handle that is its own mirror image fits as well turned round as mirrored, so that no image tells which it is.
+    `found_deg` has by how much each object is turned at the end against its nominal pose; None: that is not known. A
+    search may only have turned back what a stage before it had turned.
     """
     searches = {step.name for step in steps if isinstance(step, TurnSearch)}
     told = []
@@ -146,7 +150,8 @@ def turned_from_where_told(steps: Sequence[Step], trace: Sequence[StageRecord]) 
         for name in record.moving if record.name in searches else ():
             first, then = (each.poses.camera1_from[name][:3, :3] for each in (before, record))
             deg = float(rotation_angle(first.T @ then)) * 180 / math.pi
-            if deg > _NEAR_DEG:
+            at_end = found_deg.get(name)
+            if deg > _NEAR_DEG and (at_end is None or at_end > _NEAR_DEG):
                 told.append(
                     f"the {name} was found turned by {deg:.0f}° about its guide against its nominal pose: if that pose "
                     "is right, the model is mirrored, or not the one in the images; if it fits there in the overlay, "

@@ -103,10 +103,12 @@ def test_a_turn_that_is_found_far_from_the_nominal_one_is_told(scene: Scene) -> 
     before = StageRecord("device, coarse", None, 0.5, 1, 0.1, "small step", turned(120), moving=("probe",))
     (far,) = SEARCH.run(scene, turned(120), seed=0)
     (near,) = SEARCH.run(scene, turned(3), seed=0)
-    (doubt,) = turned_from_where_told([SEARCH], [before, far])
+    (doubt,) = turned_from_where_told([SEARCH], [before, far], {})
     assert "the probe was found turned by 1" in doubt
-    assert turned_from_where_told([SEARCH], [replace(before, poses=turned(3)), near]) == ()
-    assert turned_from_where_told([], [before, far]) == ()
+    assert turned_from_where_told([SEARCH], [replace(before, poses=turned(3)), near], {}) == ()
+    assert turned_from_where_told([], [before, far], {}) == ()
+    assert turned_from_where_told([SEARCH], [before, far], {"probe": 1.4}) == ()  # turned back, by the search
+    assert len(turned_from_where_told([SEARCH], [before, far], {"probe": 170.0})) == 1
 
 
 def test_what_has_no_guide_or_is_round_is_left_out(scene: Scene) -> None:
