@@ -3,8 +3,9 @@
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from io import BufferedReader
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -25,14 +26,34 @@ def inputs_digest(case: Case, others: Mapping[str, Path | None] | None = None, s
     files. It takes a second for each gigabyte. Raises `InputError` for a file that cannot be read.
     """
     found = hashlib.sha256(json.dumps(plain(settings)).encode())
-    for name, path in _files(case, others or {}):
+    for name, path in _files(case, _named(case.folder / "case.yaml", "case.yaml", set()), others or {}):
         found.update(f"{name}\0{_content(path)}\0".encode())
     return found.hexdigest()[:32]
 
 
-def _files(case: Case, others: Mapping[str, Path | None]) -> Iterator[tuple[str, Path]]:
-    """Every file with the name that it has wherever the case lies, in an order that does not change."""
-    for name, path in _named(case.folder / "case.yaml", "case.yaml", set()):
+def case_digest(case: Case) -> str:
+    """Digest as of `inputs_digest`, of what a case is registered from alone: without its truth, which may come later.
+
+    Comments and the order of keys in `case.yaml` do not count. Raises `InputError` for a file that cannot be read.
+    """
+    file = case.folder / "case.yaml"
+    content = {key: value for key, value in read_yaml(file).items() if key != "truth"}
+    found = hashlib.sha256(json.dumps(plain(content), sort_keys=True).encode())
+    texts = [text for text in dict.fromkeys(_texts(content)) if _is_file(case.folder / text)]
+    named = chain.from_iterable(_named(case.folder / text, text, {file}) for text in texts)
+    for name, path in _files(case, named, {}):
+        found.update(f"{name}\0{_content(path)}\0".encode())
+    return found.hexdigest()[:32]
+
+
+def _files(
+    case: Case, named: Iterable[tuple[str, Path]], others: Mapping[str, Path | None]
+) -> Iterator[tuple[str, Path]]:
+    """Every file with the name that it has wherever the case lies, in an order that does not change.
+
+    Those that are `named` in `case.yaml`, those of folders, and `others` by what they are for.
+    """
+    for name, path in named:
         yield name, path
         if (values := file_of_values(path)) != path:
             yield f"values of {name}", values

@@ -56,6 +56,7 @@ class Result:
     versions: dict[str, str] = field(default_factory=dict)
     errors: dict[str, Any] | None = None  # against the case's truth, where it has one: see `femoreg_torch.evaluation`
     inputs: str = ""  # digest of all that it was made of, see `case/inputs.py`
+    case_files: str = ""  # of its case alone, without a truth
     case: str | None = None  # the case's folder, seen from that of the result
     doubts: tuple[str, ...] = ()  # what speaks against it besides the quality of its objects
 

@@ -52,6 +52,8 @@ def result_content(result: Result) -> dict[str, Any]:
     }
     if result.inputs:
         content["inputs"] = result.inputs
+    if result.case_files:
+        content["case_files"] = result.case_files
     if result.errors is not None:
         content["errors"] = result.errors
     if result.case is not None:
@@ -118,6 +120,7 @@ def read_result(run: Path) -> Result:
         seed=top.whole("seed", 0, 2**63 - 1) if "seed" in top else 0,
         versions={str(key): str(value) for key, value in _mapping(top, "versions").items()},
         inputs=str(top.content.get("inputs", "")),
+        case_files=str(top.content.get("case_files", "")),
         errors=_mapping(top, "errors") if "errors" in top else None,
         case=top.text("case", "a folder") if "case" in top else None,
         doubts=tuple(_doubts(top)),

@@ -122,6 +122,7 @@ def register_into(
     from dataclasses import replace
 
     from femoreg_torch.case import RESULT_NAME, new_folder, result_content, write_json
+    from femoreg_torch.case.inputs import case_digest
     from femoreg_torch.case.review import REVIEW_NAME
     from femoreg_torch.case.start_files import read_pixels, read_start_poses
     from femoreg_torch.drr import CPU
@@ -143,6 +144,7 @@ def register_into(
     marks = None if landmarks is None else read_pixels(landmarks)
     poses = None if start is None else read_start_poses(start)
     # before all is read: of a file that changes meanwhile it is not the digest that the next command finds
+    case_files = case_digest(case)
     inputs = inputs_of(case, preset, weights, landmarks=landmarks, start=start, robot=robot)
     result, scene = register_scene(
         case,
@@ -160,6 +162,7 @@ def register_into(
         result,
         errors=evaluate(case, result, scene),
         inputs=inputs,
+        case_files=case_files,
         case=os.path.relpath(case.folder.resolve(), out.resolve()),
     )
     navigation = None if result.object_from_tool is None else navigation_content(result, calibration)

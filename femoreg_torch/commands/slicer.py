@@ -21,7 +21,7 @@ def slicer(run: Path, *, case: Path | None = None, out: Path | None = None) -> N
 
     from femoreg_torch.case import case_folder, new_folder, read_case, read_result
     from femoreg_torch.commands.replay import case_of
-    from femoreg_torch.evaluation.fit import check_fits, check_plan_fits
+    from femoreg_torch.evaluation.fit import check_fits, check_made_of, check_plan_fits
     from femoreg_torch.files import check_new_folder
     from femoreg_torch.neighbours.slicer import SCENE_FOLDER, SCENE_NAME, outside_ct, write_scene
 
@@ -31,6 +31,7 @@ def slicer(run: Path, *, case: Path | None = None, out: Path | None = None) -> N
     check_new_folder(folder, of)
     content = read_case(of)
     check_fits(content, result)
+    check_made_of(content, result)
     check_plan_fits(content, result)
     with new_folder(folder) as built:
         write_scene(built, content, result, standing=folder)

@@ -3,6 +3,7 @@
 import torch
 
 from femoreg_torch.case import Case, Result
+from femoreg_torch.case.inputs import case_digest
 from femoreg_torch.case.result import path_in_camera1
 from femoreg_torch.errors import InputError, shortened
 
@@ -21,6 +22,15 @@ def check_fits(case: Case, result: Result) -> None:
     if views != len(case.views):
         raise InputError(
             f"the result has {views} views, but {case.folder} has {len(case.views)}. Name the case that was registered."
+        )
+
+
+def check_made_of(case: Case, result: Result) -> None:
+    """Raises `InputError` if a result was made of another case, or of other files; of an older one nobody knows."""
+    if result.case_files and result.case_files != case_digest(case):
+        raise InputError(
+            f"{case.folder}: the result was made of another case, or its case.yaml, CT, labels, images or models were "
+            "changed since. Name the case that was registered, or register again."
         )
 
 

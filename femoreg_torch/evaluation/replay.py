@@ -14,7 +14,7 @@ from PIL import Image
 from femoreg_torch.case import Case, Result, Verdict
 from femoreg_torch.errors import InputError
 from femoreg_torch.evaluation.colours import OBJECT_COLOURS, Colour
-from femoreg_torch.evaluation.fit import check_fits
+from femoreg_torch.evaluation.fit import check_fits, check_made_of
 from femoreg_torch.evaluation.overlay import (
     Picture,
     Renderer,
@@ -63,6 +63,7 @@ def write_replay(path: Path, case: Case, result: Result) -> None:
     if suffix not in SUFFIXES:
         raise InputError(f"{path}: the replay is a moving picture. Choose a name that ends in {', '.join(SUFFIXES)}.")
     check_fits(case, result)
+    check_made_of(case, result)
     scene = prepare_scene(case)
     frames = list(frames_of(result, scene))
     pictures = draw_frames(case, scene, frames, _verdict(result.verdict))

@@ -5,7 +5,7 @@ from typing import Any
 
 from femoreg_torch.case import Case, Result, new_folder
 from femoreg_torch.evaluation.errors import errors, reference_points
-from femoreg_torch.evaluation.fit import check_fits, check_plan_fits
+from femoreg_torch.evaluation.fit import check_fits, check_made_of, check_plan_fits
 from femoreg_torch.evaluation.overlay import draw, overlay_figure
 from femoreg_torch.files import write_json, write_text
 from femoreg_torch.pictures import write_picture
@@ -35,6 +35,7 @@ def write_report(case: Case, result: Result, run: Path) -> dict[str, Any] | None
 
     check_fits(case, result)
     check_plan_fits(case, result)
+    check_made_of(case, result)
     scene = prepare_scene(case)
     found = evaluate(case, result, scene)
     drawn = draw(scene, result.poses, PANEL_PX)

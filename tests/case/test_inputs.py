@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from femoreg_torch.case import read_case
-from femoreg_torch.case.inputs import inputs_digest
+from femoreg_torch.case.inputs import case_digest, inputs_digest
 from femoreg_torch.errors import InputError
 
 CASE = """\
@@ -68,12 +68,13 @@ def test_a_changed_file_is_told_though_size_and_time_are_those_of_old(name: str,
     case = write(tmp_path)
     path = tmp_path / name
     os.utime(path, (0, 0))
-    before = of(case)
+    before, of_case = of(case), case_digest(read_case(case))
     changed = CHANGED[name] if CHANGED[name] != FILES[name] else FILES[name].swapcase()
     assert len(changed) == len(FILES[name]) or name == "case/carm.yaml"
     path.write_text(changed, encoding="utf-8")
     os.utime(path, (0, 0))
     assert of(case) != before
+    assert case_digest(read_case(case)) != of_case
 
 
 @pytest.mark.parametrize(
@@ -98,6 +99,16 @@ def test_neither_place_nor_time_nor_what_is_not_read_counts(tmp_path: Path) -> N
     (case / "notes.txt").write_text("looked at", encoding="utf-8")
     os.utime(case / "a.tif", (0, 0))
     assert of(case) == before
+
+
+def test_a_truth_that_comes_later_and_comments_make_no_other_case(tmp_path: Path) -> None:
+    folder = write(tmp_path)
+    case = read_case(folder)
+    before = case_digest(case)
+    (folder / "truth.json").write_text("{}", encoding="utf-8")
+    file = folder / "case.yaml"
+    file.write_text(f"# looked at\ntruth: truth.json\n{file.read_text(encoding='utf-8')}", encoding="utf-8")
+    assert case_digest(case) == before
 
 
 def test_other_files_and_settings_count(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import torch
 import yaml
 
 from femoreg_torch.case import read_case, read_result, write_json
+from femoreg_torch.case.inputs import case_digest
 from femoreg_torch.commands.evaluate import evaluate
 from femoreg_torch.commands.main import main
 from femoreg_torch.drr import project
@@ -140,6 +141,19 @@ def test_a_result_of_another_case_is_refused(procedure):
     folder, run = procedure
     change_result(run, lambda c: c.update(camera1_from_tibia=c["camera1_from_femur"]))
     with pytest.raises(InputError, match=r"an object 'tibia', but .* has pelvis, femur, device"):
+        evaluate(folder, run)
+
+
+def test_a_case_whose_files_are_not_those_of_the_result_is_refused(procedure):
+    """Exchanged images, say, that change nothing that a result tells."""
+    folder, run = procedure
+    change_result(run, lambda c: c.update(case_files=case_digest(read_case(folder))))
+    evaluate(folder, run)
+    file = folder / "case.yaml"
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    content["views"][0], content["views"][-1] = content["views"][-1], content["views"][0]
+    file.write_text(yaml.safe_dump(content), encoding="utf-8")
+    with pytest.raises(InputError, match="was made of another case"):
         evaluate(folder, run)
 
 
