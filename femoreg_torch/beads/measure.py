@@ -128,6 +128,7 @@ class _Matcher:
                 self.notes.append(str(error))
                 continue
             pose = match.camera_from_object
+            self.notes += self._left_out(thing, name, match)
             for bead, spot in enumerate(match.spots.tolist()):
                 if spot >= 0:
                     column, row = pixels[spot].tolist()
@@ -138,6 +139,26 @@ class _Matcher:
             raise problem or InputError(f"beads of {thing.object}: none are annotated in view 1. Annotate them there.")
         elif problem is not None:
             self.problems.setdefault(view, str(problem))
+
+    def _left_out(self, thing: Beads, name: str, match: Match) -> list[str]:
+        """In words, which shadows that somebody gave the name of a bead do not lie where the others put that bead."""
+        if self.given.marks is None:
+            return []
+        marks = [mark for mark in self.given.marks[name] if _may_be(mark, thing)]
+        used = set(match.spots.tolist())
+        told = []
+        for number, mark in enumerate(marks):
+            if mark.bead is not None and number not in used:
+                point = thing.points[thing.names.index(mark.bead)]
+                drawn = project_points(self.camera, transform_points(match.camera_from_object, point[None]))[0]
+                off = float((drawn - torch.tensor(mark.pixel, dtype=torch.float64)).norm())
+                told.append(f"{mark.bead} ({off:.0f} pixels off)")
+        if not told:
+            return []
+        return [
+            f"beads of {thing.object} in {name}: left out, as the others put them elsewhere: {', '.join(told)}. Were "
+            "two names exchanged, or another shadow taken?"
+        ]
 
     def _learn(self, thing: Beads, view: int, pose: Tensor) -> None:
         if view == 0:

@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     traceback where the environment has FEMOREG_TRACEBACK.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    commands = {command.name: command for command in entry_points(group=GROUP)}
+    commands = _commands(entry_points(group=GROUP))
     try:
         try:
             return _carry_out(arguments, commands)
@@ -92,6 +92,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     except Exception as error:
         return _tell_defect(error)
+
+
+def _commands(found: Iterable[EntryPoint]) -> dict[str, EntryPoint]:
+    """By name, in their order; of several of one name this project's own, which no other package replaces."""
+    commands: dict[str, EntryPoint] = {}
+    for command in found:
+        is_own = command.dist is not None and command.dist.name == "femoreg-torch"
+        if command.name not in commands or is_own:
+            commands[command.name] = command
+    return commands
 
 
 def _place(error: OSError) -> str:

@@ -97,20 +97,21 @@ def _read_text(path: Path, names: _Names) -> dict[str, Tensor]:
             if name in rows:
                 raise InputError(f"{path}, line {number}: `{name}` stands there twice. Keep one.")
         elif words:
-            rows.setdefault(name, []).append(_row(words, f"{path}, line {number}"))
+            rows.setdefault(name, []).append(_row(words, f"{path}, line {number}", names))
     for key, matrix in rows.items():
         if len(matrix) != 4:
             raise InputError(f"{path}, {key}: {len(matrix)} rows found, a 4×4 matrix has four.")
     return {key: torch.tensor(matrix, dtype=torch.float64) for key, matrix in rows.items()}
 
 
-def _row(words: list[str], where: str) -> list[float]:
+def _row(words: list[str], where: str, names: _Names) -> list[float]:
     try:
         values = [float(word) for word in words]
     except ValueError:
         values = []
     if len(values) != 4:
         raise InputError(
-            f"{where}: four numbers or the name of a matrix were expected, found {shortened(' '.join(words))}."
+            f"{where}: four numbers or the name of a matrix ({', '.join(sorted(names.direct | names.by_flange))}) were "
+            f"expected, found {shortened(' '.join(words))}."
         )
     return values

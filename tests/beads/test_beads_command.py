@@ -27,6 +27,7 @@ from femoreg_torch.geometry import (
     centred_camera,
     exp_se3,
     pose_difference,
+    project_points,
     rigid,
     transform_points,
 )
@@ -177,6 +178,33 @@ def test_beads_give_the_truth_and_are_taken_out(
     entry, *_ = rows
     assert float(entry["value"]) == pytest.approx(0, abs=1e-6)
     assert float(entry["beads_alone"]) == pytest.approx(trial.truth["entry_point_mm"])
+
+
+def test_an_annotated_shadow_that_fits_no_bead_of_its_name_is_told(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_landmarks(folder / "bone.mrk.json", {f"f{n}": point for n, point in enumerate(BONE)})
+    lines = ["image,bead,column_px,row_px"]
+    for view in range(2):
+        for kind, names in (("plain", ("femur",)), ("tool", ("femur", "device"))):
+            for name in names:
+                beads = {"femur": BONE, "device": TOOL}[name]
+                pixels = project_points(CAMERA, transform_points(TRUE.camera_from(name)[view], beads))
+                for n, (column, row) in enumerate(pixels.tolist()):
+                    off = 40 if (view, kind, name, n) == (0, "tool", "device", 2) else 0
+                    bead = f"{'f' if name == 'femur' else 't'}{n}"
+                    lines.append(f"v{view + 1}_{kind}.tif,{bead},{column + off:.2f},{row:.2f}")
+    (folder / "shadows.csv").write_text("\n".join(lines), encoding="utf-8")
+    (folder / "beads.yaml").write_text(
+        "objects:\n  femur: {points: bone.mrk.json, diameter_mm: 2}\n"
+        "  device: {points: tool.mrk.json, diameter_mm: 2}\nannotations: shadows.csv\n",
+        encoding="utf-8",
+    )
+    assert main(["beads", str(folder), "--beads", str(folder / "beads.yaml"), "--out", str(tmp_path / "I")]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "beads of device in v1_tool.tif: left out, as the others put them elsewhere: t2 (40 pixels off)" in printed
+    (note,) = read_json(tmp_path / "I" / "truth_uncertainty.json")["notes"]
+    assert "t2" in note
 
 
 def test_fractions_are_not_rounded_away_where_beads_are_taken_out(folder: Path, tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ import sys
 import time
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal, cast
 
 import pytest
 from rich.console import Console
@@ -247,6 +248,15 @@ def test_unreadable_files_are_one_line(tmp_path: Path, what: str, kind: str, cap
     error = capfd.readouterr().err
     assert error.startswith(f"femoreg: {path}: ")
     assert error.count("\n") == 1
+
+
+def test_another_package_replaces_no_command_of_this_one() -> None:
+    def command(name: str, package: str) -> SimpleNamespace:
+        return SimpleNamespace(name=name, dist=SimpleNamespace(name=package))
+
+    own, theirs, more = command("fail", "femoreg-torch"), command("fail", "other"), command("paint", "other")
+    for order in ([own, theirs, more], [theirs, own, more]):
+        assert module._commands(cast(Any, order)) == {"fail": own, "paint": more}
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
