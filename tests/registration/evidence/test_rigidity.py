@@ -97,7 +97,17 @@ def test_a_model_of_known_materials_is_doubted_sooner(
 
 @pytest.mark.parametrize(
     ("gain", "sigmas", "apart", "told"),
-    [(0.0014, 8.5, 1.2, 1), (0.0052, 8.8, 0.9, 1), (0.0025, 6.2, 1.8, 0), (0.0003, 8.5, 1.2, 0), (0.0014, 8.5, 0.6, 0)],
+    [
+        (0.0014, 8.5, 1.2, 1),
+        (0.0052, 8.8, 0.9, 1),
+        (0.0025, 6.2, 1.8, 0),
+        (0.0003, 8.5, 1.2, 0),
+        (0.0014, 8.5, 0.6, 0),
+        (0.0039, 12.0, 0.5, 1),
+        (0.0039, 8.0, 0.5, 0),
+        (0.0020, 12.0, 0.5, 0),
+        (0.0039, 12.0, 0.35, 0),
+    ],
 )
 def test_a_model_of_unknown_materials_is_bent_only_where_that_is_sure_and_explains_much(
     scene: Scene, monkeypatch: pytest.MonkeyPatch, gain: float, sigmas: float, apart: float, told: int
