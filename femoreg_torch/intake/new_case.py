@@ -87,11 +87,10 @@ def _sources(content: dict[str, Any], given: NewCase) -> dict[str, Path]:
     """The files given, by the names that the case has for those that are read first when it is checked."""
     views = content["views"]
     sources = {view["anatomy"]: path for view, path in zip(views, image_files(given.images, []), strict=True)}
-    if given.device is not None:
-        sources[content[DEVICE]["model"]] = given.device
     if str(content["carm"]).endswith((".yaml", ".yml")):
         sources[content["carm"]] = Path(str(given.carm))
     if given.device is not None:
+        sources[content[DEVICE]["model"]] = given.device
         sources |= {view[DEVICE]: path for view, path in zip(views, image_files(given.device_images, []), strict=False)}
     return sources
 

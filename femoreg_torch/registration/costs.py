@@ -251,11 +251,12 @@ class ImageCosts:
                 jacobians.append(change * hardened_slope(seen[target.view, name][0], self.objects[name].hardening))
         for rates in shapes:
             change = torch.zeros_like(target.background)[None]
-            for name in set(rates) & set(target.moving):
-                pose, rate = poses[target.moving.index(name)], _DEFORMED * rates[name]
-                deformed = pose @ torch.stack([torch.eye(4) + rate, torch.eye(4) - rate])
-                more, less = draw([self.objects[name]], deformed[:, None], camera, self.step_mm)
-                change = change + (more - less) / (2 * _DEFORMED)
+            for name, pose in zip(target.moving, poses, strict=True):
+                if name in rates:
+                    rate = _DEFORMED * rates[name]
+                    deformed = pose @ torch.stack([torch.eye(4) + rate, torch.eye(4) - rate])
+                    more, less = draw([self.objects[name]], deformed[:, None], camera, self.step_mm)
+                    change = change + (more - less) / (2 * _DEFORMED)
             jacobians.append(change)
         changes = torch.cat(jacobians)
         if target.scatter is not None:
