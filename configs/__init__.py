@@ -78,6 +78,9 @@ def _named(value: Any) -> bool:
 
 def _merged(base: list[dict[str, Any]], changes: list[dict[str, Any]], where: str) -> list[dict[str, Any]]:
     entries = list(base)
+    told = [change["name"] for change in changes]
+    if twice := next((name for name in told if told.count(name) > 1), None):
+        raise InputError(f"{where}: {told.count(twice)} entries are named {shortened(twice)}. Rename them.")
     for change in changes:
         entry = dict(change)
         names = [other["name"] for other in entries]

@@ -40,6 +40,12 @@ def test_a_name_that_is_not_there_is_told(change: dict[str, object]) -> None:
         laid_over(BASE, {"steps": [change]}, "f")
 
 
+def test_two_changes_of_one_name_are_told() -> None:
+    twice = {"steps": [{"name": "one", "n": 2}, {"name": "one", "m": 3}]}
+    with pytest.raises(InputError, match="f, steps: 2 entries are named 'one'"):
+        laid_over(BASE, twice, "f")
+
+
 def test_a_file_extends_a_preset_or_a_file_beside_it(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("extends: cios_fusion\nsdd_mm: 990\n", encoding="utf-8")
     (tmp_path / "yours.yaml").write_text("extends: mine.yaml\nshape: [768, 768]\n", encoding="utf-8")

@@ -57,6 +57,13 @@ def test_a_figure_is_the_same_file_every_time(study: pd.DataFrame, tmp_path: Pat
     assert texts[0] == texts[1]
 
 
+def test_correlations_of_runs_that_share_procedures_say_so() -> None:
+    alone = made_up(12)
+    twice = pd.concat([alone, alone.assign(condition="other")], ignore_index=True)
+    captions = [next(p for p in all_figures(rows) if p.name == "correlations").caption for rows in (alone, twice)]
+    assert ["taken as independent" in caption for caption in captions] == [False, True]
+
+
 def test_what_a_study_does_not_tell_is_not_drawn() -> None:
     rows = made_up(12)
     rows = rows.drop(columns=[c for c in rows if "_sigma_" in c or c.startswith("varied_")])

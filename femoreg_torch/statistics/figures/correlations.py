@@ -8,6 +8,7 @@ from femoreg_torch.statistics.formats import between, number
 from femoreg_torch.statistics.intervals import Correlation, pearson, spearman
 from femoreg_torch.statistics.outcome import told
 from femoreg_torch.statistics.quantities import BY_COLUMN, PAPER_CORRELATIONS, PELVIS_AT_HEAD
+from femoreg_torch.statistics.rows import procedures
 
 _PAIRS = (  # the paper's two first
     (PELVIS_AT_HEAD, "femur_mm"),
@@ -41,6 +42,8 @@ def correlations(rows: pd.DataFrame) -> Plot | None:
         "r: Pearson, ρ: Spearman, with 95 % intervals over all n runs, "
         "also those beyond the axes."
     )
+    if procedures(rows).nunique() < len(rows):
+        caption += " Runs of one procedure are taken as independent here, so that these intervals are too narrow."
     return Plot("correlations", "Errors that go together", caption, figure)
 
 
