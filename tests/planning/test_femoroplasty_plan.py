@@ -339,7 +339,7 @@ def test_commands_end_to_end(
         (["--study", str(bad / "words")], "numbers were expected"),
         (["--study", str(bad / "empty")], "no trusted run"),
         (["--study", str(bad / "cut")], "cannot be read as Parquet"),
-        (["--covariance", str(bad / "sure.csv")], "rows of numbers"),
+        (["--covariance", str(bad / "sure.csv")], "sure.csv, line 1: numbers were expected"),
         ([*wide, "--mean", "[200, 0, 0]"], "in none of 4 draws"),
         ([], "either --study or --covariance"),
         (["--covariance", str(folder / "no.csv")], "no such file"),

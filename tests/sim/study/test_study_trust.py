@@ -18,6 +18,7 @@ def record(number: int, kind: int, off_mm: float, trusted: bool) -> dict[str, An
 
 def test_runs_are_counted_by_sabotage(tmp_path: Path) -> None:
     records = [record(1, 0, 0.3, True), record(1, 0, 9.0, False), record(1, 0, 9.0, False), record(2, 1, 30.0, True)]
+    records = [each | {"settings": f"s{n}"} for n, each in enumerate(records)]
     text = write_trust(frame_of(records), "fast", tmp_path)
     rows = {line.split("|")[1].strip(): [c.strip() for c in line.split("|")[2:6]] for line in text.splitlines()[2:8]}
     assert rows[SABOTAGES[0].name] == ["1", "0", "0", "2"]
