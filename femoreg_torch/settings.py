@@ -5,7 +5,7 @@ import functools
 import json
 import re
 from argparse import Action
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -44,10 +44,19 @@ class _Help(DefaultHelpFormatter):
 
 def _kind_in_words(kind: str) -> str:
     """How help tells the type of a value, which jsonargparse writes as Python does; a choice lists its words itself."""
-    kind = _CLASS.sub(r"\1", kind).removesuffix(" | null")
+    kind = re.sub(r"Optional\[(.*)\]", r"\1", _CLASS.sub(r"\1", kind).removesuffix(" | null"))
     if listed := re.fullmatch(r"(?:list|tuple)\[(\w+)(?:, \.\.\.)?\]", kind):
         return f"{LIST} of {_WORDS_OF_MANY[listed[1]]}"
-    return "" if kind.startswith("Literal") else _WORDS.get(kind, kind.lower())
+    union = re.fullmatch(r"Union\[(.*)\]", kind)
+    if union is None and kind.startswith("Literal"):
+        return ""
+    return _either([each for each in (union[1] if union else kind).split(", ") if each != "null"])
+
+
+def _either(kinds: Sequence[str]) -> str:
+    """Types or choices in words, `or` before the last."""
+    words = [_WORDS.get(kind, _CHOICE.sub(r"\1", kind)) for kind in kinds]
+    return " or ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
 
 
 def _argument(text: str) -> Any:
@@ -68,7 +77,7 @@ _REFUSED = re.compile(
 _KEY = re.compile(r'Parser key "([^"]*)": (.*)')
 _WORDS = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "Path": "a path"}
 _WORDS_OF_MANY = {"int": "whole numbers", "float": "numbers", "str": "texts", "Path": "paths"}
-_CHOICE = re.compile(r"typing\.Literal\[(.*)\]")
+_CHOICE = re.compile(r"(?:typing\.)?Literal\[(.*)\]")
 _DEFAULT_OF_A_FLAG = " (default: %(default)s)"  # as jsonargparse writes it
 LIST = "a list"  # how `told` begins where one was expected
 
@@ -89,8 +98,7 @@ def _in_words(found: re.Match[str]) -> str:
     elif listed := re.fullmatch(r"list(?:\[(?:\w+\.)*(\w+)\])?", kinds):
         kinds = f"{LIST}{f' of {_WORDS_OF_MANY[listed[1]]}' if listed[1] in _WORDS_OF_MANY else ''}"
     else:
-        words = [_WORDS.get(kind, _CHOICE.sub(r"\1", kind)) for kind in kinds.split(", ")]
-        kinds = " or ".join([", ".join(words[:-1]), words[-1]] if words[1:] else words)
+        kinds = _either(kinds.split(", "))
     return f"{kinds} was expected, found {shortened(found[3])}"
 
 

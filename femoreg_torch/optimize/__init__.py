@@ -5,7 +5,7 @@ from femoreg_torch.optimize.cmaes import CmaEs
 from femoreg_torch.optimize.kinds import read_optimiser
 from femoreg_torch.optimize.levenberg import LevenbergMarquardt
 from femoreg_torch.optimize.parabola import parabola_minimum
-from femoreg_torch.optimize.quadratic import Quadratic, SmoothObjective
+from femoreg_torch.optimize.quadratic import Profile, Quadratic, SmoothObjective, profile
 from femoreg_torch.optimize.result import BestSoFar, Objective, Optimiser, Result, Stop
 
 __all__ = [
@@ -15,10 +15,12 @@ __all__ = [
     "LevenbergMarquardt",
     "Objective",
     "Optimiser",
+    "Profile",
     "Quadratic",
     "Result",
     "SmoothObjective",
     "Stop",
     "parabola_minimum",
+    "profile",
     "read_optimiser",
 ]

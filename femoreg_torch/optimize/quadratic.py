@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 
@@ -29,3 +30,21 @@ class SmoothObjective:
 
     def __call__(self, deltas: Tensor) -> Tensor:
         return self.values(deltas)
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """What a quadratic says of its last m unknowns with the n others refitted to them."""
+
+    answer: Tensor  # (n, m): how the others move with them, J = −Hxx⁻¹ Hxq
+    curvature: Tensor  # (m, m): S = Hqq + Hqx J
+    scores: Tensor  # (T, m): of parts of the data, r = s_q + Jᵀ s_x
+
+
+def profile(model: Quadratic, last: int) -> Profile:
+    """The profile of a quadratic in its `last` unknowns, so many."""
+    n = len(model.hessian) - last
+    hessian = model.hessian
+    answer = -torch.linalg.pinv(hessian[:n, :n], hermitian=True) @ hessian[:n, n:]
+    scores = model.scores[:, n:] + model.scores[:, :n] @ answer
+    return Profile(answer, hessian[n:, n:] + hessian[n:, :n] @ answer, scores)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.geometry import CameraChange
-from femoreg_torch.optimize import Quadratic
+from femoreg_torch.optimize import Quadratic, profile
 
 # The penalty that a deviation of one standard deviation adds to the mean patch NCC is half of this. Near a solution the
 # mean patch NCC behaves like a log-likelihood times 2e-5 (R / S of `registration.evidence.covariance` over development
@@ -91,24 +91,6 @@ class Intrinsics:
         return rows[:, self.free]
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
-    """What images say of the intrinsics with the bodies refitted, from a quadratic of bodies and then intrinsics."""
-
-    answer: Tensor  # (Σ n_b, n): how the bodies move with the intrinsics, J = −Hxx⁻¹ Hxq
-    curvature: Tensor  # (n, n): S = Hqq + Hqx J
-    scores: Tensor  # (T, n): of tiles, r = s_q + Jᵀ s_x
-
-
-def profile(model: Quadratic, intrinsics: Intrinsics) -> Profile:
-    """The profile of a model whose last degrees of freedom are the intrinsics."""
-    n = len(model.hessian) - len(intrinsics.free)
-    hessian = model.hessian
-    answer = -torch.linalg.pinv(hessian[:n, :n], hermitian=True) @ hessian[:n, n:]
-    scores = model.scores[:, n:] + model.scores[:, :n] @ answer
-    return Profile(answer, hessian[n:, n:] + hessian[n:, :n] @ answer, scores)
-
-
 def refined(changes: Sequence[CameraChange]) -> frozenset[str]:
     """Which parts of the C-arm's file cameras that changed so no longer have: `DISTANCE`, `POINTS`."""
     distance = any(change.sdd_factor != 1 for change in changes)
@@ -137,7 +119,7 @@ def doubts(model: Quadratic, intrinsics: Intrinsics) -> dict[str, float]:
     A step of Newton along each by itself, the bodies refitted, is compared with its deviation: that of the sandwich
     estimator over tiles, and what images that are drawn a little wrong feign.
     """
-    found = profile(model, intrinsics)
+    found = profile(model, len(intrinsics.free))
     ways = torch.zeros(len(intrinsics.scale), 3, dtype=torch.float64)
     ways[0, 0] = ways[1::2, 1] = ways[2::2, 2] = 1.0
     ways = (ways / intrinsics.scale[:, None])[intrinsics.free]  # (n, 3): how a delta changes them by 1, and by 1 mm

@@ -2,6 +2,8 @@
 
 import math
 
+from torch import Tensor
+
 from femoreg_torch.case import Case
 from femoreg_torch.geometry import Poses
 from femoreg_torch.registration.evidence.ct_shape import Amount, ct_shape
@@ -10,7 +12,7 @@ from femoreg_torch.registration.scene import Scene
 
 # Right CTs seemed stretched by 0.3 % and sheared by 1.0 % at most, in 19 procedures and 21 faults of other kinds of
 # another simulator, but for small fields and dark views, by 1.4 deviations at most. Of the same: slices told 1 and 2 %
-# too near or too far, and pixels 1 % too wide or high, by 1.0 to 2.0 %; gantries tilted by 1.5 and 4°, 1.2 and 3.8°, by
+# too near or too far, and pixels 1 % too wide or high, by 1.0 to 2.0 %; gantries tilted by 1.5 and 4°, 1.3 and 3.8°, by
 # 2.6 deviations. The deviation holds the misfit itself, so that more of it is no surer.
 _MOST_STRETCHED, _MOST_SHEARED = 0.008, 0.012
 _SURE = 2.0  # deviations
@@ -33,10 +35,11 @@ def doubts_about_the_ct(case: Case, scene: Scene, poses: Poses, imaging: Imaging
             f"{deviation:.1f} %): check the slices' distance and the pixel size in the CT's header, and whether the "
             "pictures' pixels are as wide and as high as the C-arm's file says"
         )
-    for way, amount in (("from front to back", found.tilt), ("from side to side", found.slide)):
+    rows, columns, _ = scene.objects[scene.anchor].volume.lps_from_index[:3, :3].T
+    for way, amount in ((columns, found.tilt), (rows, found.slide)):
         if _is_sure(amount, _MOST_SHEARED):
             told.append(
-                f"the images show the bones sheared by {_degrees(amount.value):.1f}° {way} against the CT (± "
+                f"the images show the bones sheared by {_degrees(amount.value):.1f}° {_along(way)} against the CT (± "
                 f"{_degrees(amount.deviation):.1f}°): was the CT's gantry tilted, without its program knowing, or did "
                 "the patient slide while it was taken?"
             )
@@ -45,6 +48,11 @@ def doubts_about_the_ct(case: Case, scene: Scene, poses: Poses, imaging: Imaging
 
 def _is_sure(amount: Amount, most: float) -> bool:
     return abs(amount.value) > most and amount.sureness > _SURE
+
+
+def _along(way: Tensor) -> str:
+    """The patient's axis that a direction (3,) in LPS is nearest to, in words."""
+    return ("from side to side", "from front to back", "from head to foot")[int(way.abs().argmax())]
 
 
 def _degrees(shear: float) -> float:

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from femoreg_torch.geometry import Poses
 from femoreg_torch.geometry.rigid import skew
-from femoreg_torch.optimize import Quadratic
+from femoreg_torch.optimize import Profile, Quadratic, profile
 from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.evidence.motion import (
     GuideDrift,
@@ -43,7 +43,7 @@ from femoreg_torch.registration.evidence.motion import (
     turns_in_joints,
 )
 from femoreg_torch.registration.imaging import PLAIN, Imaging
-from femoreg_torch.registration.intrinsics import Intrinsics, Profile, profile
+from femoreg_torch.registration.intrinsics import Intrinsics
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import mean_quadratic
 from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, reference_point_in_view
@@ -168,7 +168,7 @@ def pose_covariance(
     scores = _by_place(parts, [view for _, view in images])[:, :rigid]
     of_places = len(scores) / max(1, len(scores) - 1)
     by_images = of_places * inverse @ (scores.T @ scores) @ inverse + by_materials @ by_materials.T
-    of_intrinsics = profile(model, refined)
+    of_intrinsics = profile(model, len(refined.free))
     mean, spread = _estimate(of_intrinsics, clusters, refined)
     response = of_intrinsics.answer + _slides(refined, poses, bodies)
     off = mean - refined.units_off

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
+from femoreg_torch.optimize import profile
 from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
@@ -46,8 +47,8 @@ class CtShape:
     """How the images would deform the bones of a CT. Each amount is asked by itself, the other two being zero."""
 
     stretch: Amount  # along the slices' normal: 0.01 where they lie 1 % farther apart than the CT says
-    tilt: Amount  # by how much slices are shifted along their columns, from front to back, per distance between them
-    slide: Amount  # the same along their rows, from right to left
+    tilt: Amount  # by how much slices are shifted along their columns, per distance between them
+    slide: Amount  # the same along their rows
 
 
 def ct_shape(scene: Scene, poses: Poses, names: Sequence[str], imaging: Imaging) -> CtShape | None:
@@ -73,12 +74,10 @@ def ct_shape(scene: Scene, poses: Poses, names: Sequence[str], imaging: Imaging)
         return None
     thing = scene.objects[scene.anchor]
     rates = _rates(thing.volume.lps_from_index, thing.reference_point)
-    n = len(costs.still)
     model = mean_quadratic(costs.quadratics(costs.still, shapes=[dict.fromkeys(names, rate) for rate in rates]))
-    answer = -torch.linalg.pinv(model.hessian[:n, :n], hermitian=True) @ model.hessian[:n, n:]
-    curvature = (model.hessian[n:, n:] + model.hessian[n:, :n] @ answer).diagonal()
-    scores = model.scores[:, n:] + model.scores[:, :n] @ answer
-    values, deviations = -scores.sum(0) / curvature, scores.square().sum(0).sqrt() / curvature
+    found = profile(model, len(rates))
+    curvature = found.curvature.diagonal()
+    values, deviations = -found.scores.sum(0) / curvature, found.scores.square().sum(0).sqrt() / curvature
     return CtShape(*map(Amount, values.tolist(), deviations.tolist()))
 
 
