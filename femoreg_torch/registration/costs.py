@@ -86,13 +86,18 @@ class ImageCosts:
         return torch.cat([target.cost(target.background[None]) for target in self.targets]).cpu()
 
     def quadratics(
-        self, delta: Tensor, unsure: Sequence[tuple[str, Volume]] = (), shapes: Sequence[Mapping[str, Tensor]] = ()
+        self,
+        delta: Tensor,
+        unsure: Sequence[tuple[str, Volume]] = (),
+        shapes: Sequence[Mapping[str, Tensor]] = (),
+        bends: Sequence[Mapping[int, Tensor]] = (),
     ) -> list[Quadratic]:
         """Each image's cost about one delta (Σ n_b,), with exact gradient and positive semi-definite curvature.
 
         The next unknowns are the amounts of what is `unsure`, differences that come to the volumes of objects by name.
-        The last are those of the `shapes`: by each, objects are deformed at once, by name at the rate (4, 4) by which
-        points of their space move. All of it on the CPU; a device is waited for once.
+        Then those of the `shapes`: by each, objects are deformed at once, by name at the rate (4, 4) by which points of
+        their space move. The last are those of the `bends`: by each, what is drawn moves in the picture, by view at the
+        rate (2, H, W), along columns and rows, px. All of it on the CPU; a device is waited for once.
         """
         steps = _STEP * torch.eye(len(delta), dtype=torch.float64)
         for _, chosen in self._intrinsics(torch.eye(len(delta), dtype=torch.float64)):
@@ -113,7 +118,7 @@ class ImageCosts:
             drawn = on_all_cores(lambda each: self._image_and_jacobian(delta, each), jobs, self._device)
         seen = dict(zip(wanted, drawn, strict=True))
         about = [
-            partial(self._changes, target, delta, poses, seen, unsure, shapes)
+            partial(self._changes, target, delta, poses, seen, unsure, shapes, bends)
             for target, (poses, _) in zip(moving, placed, strict=True)
         ]
         found = iter(zip(similarity_quadratics(about, self._device), placed, strict=True))
@@ -121,12 +126,13 @@ class ImageCosts:
         for target in self.targets:
             if target.moving:
                 (cost, scores, hessian), (_, twists) = next(found)
-                amounts = torch.eye(len(unsure) + len(shapes), dtype=torch.float64)
-                shown = amounts[[name in target.moving for name, _ in unsure] + [True] * len(shapes)]
+                others = len(shapes) + len(bends)
+                amounts = torch.eye(len(unsure) + others, dtype=torch.float64)
+                shown = amounts[[name in target.moving for name, _ in unsure] + [True] * others]
                 ways = torch.block_diag(twists, shown) if len(amounts) else twists
                 models.append(Quadratic(cost, scores @ ways, ways.T @ hessian @ ways))
             else:
-                unknowns = len(delta) + len(unsure) + len(shapes)
+                unknowns = len(delta) + len(unsure) + len(shapes) + len(bends)
                 nothing = delta.new_zeros(unknowns, unknowns)
                 models.append(Quadratic(float(target.cost(target.background[None])), nothing[:1], nothing))
         return models
@@ -225,11 +231,12 @@ class ImageCosts:
         seen: dict[tuple[int, str], tuple[Tensor, Tensor]],
         unsure: Sequence[tuple[str, Volume]],
         shapes: Sequence[Mapping[str, Tensor]],
+        bends: Sequence[Mapping[int, Tensor]],
     ) -> tuple[FixedSimilarity, Tensor, Tensor]:
         """The similarity of an image, what is drawn at a delta (n,), and its changes (H, W, m).
 
-        By the twists, by what is `unsure` of what moves, and by the `shapes`. That lies at `poses` (O, 4, 4). `seen`
-        holds each object by itself in each view.
+        By the twists, by what is `unsure` of what moves, by the `shapes` and by the `bends`. What moves lies at `poses`
+        (O, 4, 4). `seen` holds each object by itself in each view.
         """
         drawn, jacobians = target.background, []
         camera = self._camera(target, delta[None])
@@ -258,6 +265,14 @@ class ImageCosts:
                     more, less = draw([self.objects[name]], deformed[:, None], camera, self.step_mm)
                     change = change + (more - less) / (2 * _DEFORMED)
             jacobians.append(change)
+        if bends:
+            downwards, across = torch.gradient(drawn)
+            jacobians += [
+                -(across * along[0] + downwards * along[1])[None]
+                if (along := rates.get(target.view)) is not None
+                else torch.zeros_like(drawn)[None]
+                for rates in bends
+            ]
         changes = torch.cat(jacobians)
         if target.scatter is not None:
             changes *= filled_slope(below_white(drawn, target.white), target.scatter)

@@ -6,6 +6,7 @@ from itertools import chain
 from femoreg_torch.case import Case
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.geometry import Poses
+from femoreg_torch.registration.doubts.bends import doubts_about_bends
 from femoreg_torch.registration.doubts.carm import doubts_about_the_carm, doubts_about_the_views
 from femoreg_torch.registration.doubts.ct import doubts_about_the_ct
 from femoreg_torch.registration.doubts.device import (
@@ -20,6 +21,7 @@ from femoreg_torch.registration.doubts.movement import doubts_about_motion, expl
 from femoreg_torch.registration.doubts.plan import doubts_about_the_guide, doubts_about_the_plan
 from femoreg_torch.registration.doubts.shape import doubts_about_handedness, doubts_about_rigidity
 from femoreg_torch.registration.evidence.covariance import PoseCovariance
+from femoreg_torch.registration.evidence.misfits import misfits
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.quality import Limits
 from femoreg_torch.registration.scene import Scene
@@ -34,7 +36,7 @@ def doubts(
     not fit at all, nothing else that the images would say is asked.
     """
     displays = [case.display_of(view) for view in range(len(case.views))]
-    if strange := doubts_about_the_images(scene, poses, imaging):
+    if strange := doubts_about_the_images(scene, misfits(scene, poses, imaging)):
         plan = *doubts_about_the_plan(case, scene), *doubts_about_the_guide(case, poses)
         return (*told.contradictions, *doubts_about_units(case, told, True), *strange, *plan)
     clear = scene.where_unsaturated()
@@ -44,7 +46,8 @@ def doubts(
         lambda: doubts_about_motion(covariance, limits, given=scene.camera_from_camera1 is not None),
     ]
     questions: list[Callable[[], tuple[str, ...]]] = [
-        lambda: doubts_about_the_ct(case, clear, poses, imaging),  # such a CT seems to have moved or bent as well
+        # What is shown of such a CT, or in such pictures, seems to have moved or bent as well.
+        lambda: doubts_about_the_ct(case, clear, poses, imaging) or doubts_about_bends(case, clear, poses, imaging),
         *(geometry[::-1] if explains_the_carm(covariance) else geometry),
         lambda: doubts_about_the_plan(case, scene),
         lambda: doubts_about_the_guide(case, poses),

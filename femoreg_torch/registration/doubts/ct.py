@@ -6,7 +6,8 @@ from torch import Tensor
 
 from femoreg_torch.case import Case
 from femoreg_torch.geometry import Poses
-from femoreg_torch.registration.evidence.ct_shape import Amount, ct_shape
+from femoreg_torch.registration.evidence.bones import Amount
+from femoreg_torch.registration.evidence.ct_shape import ct_shape
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.scene import Scene
 
@@ -20,8 +21,8 @@ _SURE = 2.0  # deviations
 
 def doubts_about_the_ct(case: Case, scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
     """How the images would stretch and shear the bones of the CT, in words, where that is much and sure."""
-    names = [name for name, thing in case.objects.items() if thing.model is None and name in poses.camera1_from]
-    if scene.anchor not in names:
+    names = bones_of_the_ct(case, scene, poses)
+    if not names:
         return ()
     found = ct_shape(scene, poses, names, imaging)
     if found is None:
@@ -44,6 +45,12 @@ def doubts_about_the_ct(case: Case, scene: Scene, poses: Poses, imaging: Imaging
                 "the patient slide while it was taken?"
             )
     return tuple(told)
+
+
+def bones_of_the_ct(case: Case, scene: Scene, poses: Poses) -> list[str]:
+    """The objects that were cut from the CT and have a pose; none where the anchor is not among them."""
+    names = [name for name, thing in case.objects.items() if thing.model is None and name in poses.camera1_from]
+    return names if scene.anchor in names else []
 
 
 def _is_sure(amount: Amount, most: float) -> bool:

@@ -1,10 +1,11 @@
 """Images that do not show what is drawn for them, and smeared ones, in words."""
 
+from collections.abc import Iterable
+
 from femoreg_torch.geometry import Poses
 from femoreg_torch.registration.doubts.carm import ORBIT_DEG
-from femoreg_torch.registration.evidence.misfits import misfits
+from femoreg_torch.registration.evidence.misfits import Misfit
 from femoreg_torch.registration.evidence.smears import smears
-from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.scene import Scene
 
 # Of the strength of edges. Smeared by 5 to 8 mm on the detector: 0.80 to 0.94. In 60 that were not, of two
@@ -12,41 +13,41 @@ from femoreg_torch.registration.scene import Scene
 _LEAST_KEPT = 0.955
 
 
-def doubts_about_the_images(scene: Scene, poses: Poses, imaging: Imaging) -> tuple[str, ...]:
+def doubts_about_the_images(scene: Scene, found: Iterable[Misfit]) -> tuple[str, ...]:
     """Images that do not show what is drawn for them, and the likely reason, in words."""
-    told = []
-    for found in misfits(scene, poses, imaging):
-        what = f"the {found.kind} image of view {found.view + 1}"
-        beside = f"(similarity {found.similarity:.2f}, of view 1 {found.in_view_1:.2f})"
-        if found.as_view is not None:
-            told.append(
-                f"{what} shows what the other images of view {found.as_view + 1} show {beside}: are images exchanged? "
-                "Check `views` of the case"
-            )
-        elif found.as_stored is not None:
-            told.append(
-                f"{what} does not fit as the case tells it, and {found.as_stored} it does {beside}: check `display` "
-                "and `intensity` of the view, and that all of its images are stored alike"
-            )
-        elif found.kind != scene.first_kind:
-            told.append(
-                f"{what} does not show what the other image of that view shows {beside}: check that both were taken "
-                "without moving C-arm or patient, and that no images are exchanged"
-            )
-        elif scene.camera_from_camera1 is not None:
-            told.append(
-                f"{what} does not fit at the pose that the case gives {beside}: check `camera_from_camera1` of the "
-                "views (from camera 1 to that view's, in mm, not the inverse), and that the image shows the same hip"
-            )
-        else:
-            others = len(scene.there([found.kind], range(scene.views))) - 1
-            without = "; or register without that view" if others > 1 else ""
-            told.append(
-                f"{what} fits nowhere within {ORBIT_DEG:.0f}° of view 1 {beside}: check that it shows the same hip of "
-                "the same patient, and that little covers it; a C-arm that stood elsewhere needs its poses "
-                f"(`camera_from_camera1` of the views){without}"
-            )
-    return tuple(told)
+    return tuple(_told(scene, misfit) for misfit in found)
+
+
+def _told(scene: Scene, found: Misfit) -> str:
+    what = f"the {found.kind} image of view {found.view + 1}"
+    beside = f"(similarity {found.similarity:.2f}, of view 1 {found.in_view_1:.2f})"
+    if found.as_view is not None:
+        return (
+            f"{what} shows what the other images of view {found.as_view + 1} show {beside}: are images exchanged? "
+            "Check `views` of the case"
+        )
+    if found.as_stored is not None:
+        return (
+            f"{what} does not fit as the case tells it, and {found.as_stored} it does {beside}: check `display` "
+            "and `intensity` of the view, and that all of its images are stored alike"
+        )
+    if found.kind != scene.first_kind:
+        return (
+            f"{what} does not show what the other image of that view shows {beside}: check that both were taken "
+            "without moving C-arm or patient, and that no images are exchanged"
+        )
+    if scene.camera_from_camera1 is not None:
+        return (
+            f"{what} does not fit at the pose that the case gives {beside}: check `camera_from_camera1` of the "
+            "views (from camera 1 to that view's, in mm, not the inverse), and that the image shows the same hip"
+        )
+    others = len(scene.there([found.kind], range(scene.views))) - 1
+    without = "; or register without that view" if others > 1 else ""
+    return (
+        f"{what} fits nowhere within {ORBIT_DEG:.0f}° of view 1 {beside}: check that it shows the same hip of "
+        "the same patient, and that little covers it; a C-arm that stood elsewhere needs its poses "
+        f"(`camera_from_camera1` of the views){without}"
+    )
 
 
 def doubts_about_smears(scene: Scene, poses: Poses) -> tuple[str, ...]:

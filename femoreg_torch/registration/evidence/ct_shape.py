@@ -6,40 +6,18 @@ wide and high as is told show a stretched patient. Bones of such a shape do not 
 bones and C-arms lie: all of these are refitted here. A change of size alone looks like another depth.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
 from femoreg_torch.optimize import profile
-from femoreg_torch.registration.costs import image_costs
+from femoreg_torch.registration.evidence.bones import Amount, costs_of_bones
 from femoreg_torch.registration.imaging import Imaging
-from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import mean_quadratic
-from femoreg_torch.registration.scene import Body, Scene, reference_point_in_view
-from femoreg_torch.similarity import GradNcc
-
-_LEVEL = Level(pixel_mm=3.1, step_mm=2.0)
-_SIMILARITY = GradNcc(patch_radius=5)
-_SCALE = (math.pi / 180,) * 3 + (1.0,) * 3  # rad and mm: one unit of a motion
-_LEAST_VIEWS = 2  # of one view any shape is another pose, nearly
-
-
-@dataclass(frozen=True)
-class Amount:
-    """By how much the images would deform bones in one way, and its standard deviation."""
-
-    value: float
-    deviation: float
-
-    @property
-    def sureness(self) -> float:
-        """The amount by its deviation."""
-        return abs(self.value) / self.deviation if self.deviation > 0 else 0.0
+from femoreg_torch.registration.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -57,20 +35,8 @@ def ct_shape(scene: Scene, poses: Poses, names: Sequence[str], imaging: Imaging)
     A step of Newton along each way, all poses refitted, with the deviation of the sandwich estimator over tiles; see
     `registration.evidence.covariance`. None where fewer than two views show the anchor, or leave nothing to compare.
     """
-    images = scene.first_images(scene.anchor)
-    if len(images) < _LEAST_VIEWS:
-        return None
-    scale = torch.tensor(_SCALE, dtype=torch.float64)
-    carms = [view for _, view in images if view] if scene.camera_from_camera1 is None else []
-    bodies = (
-        *(Body((name,), 0, reference_point_in_view(scene, poses, name, 0), scale) for name in names),
-        *(Body((), view, reference_point_in_view(scene, poses, scene.anchor, view), scale) for view in carms),
-    )
-    try:
-        costs = image_costs(
-            scene, poses, bodies, list(poses.camera1_from), images, _LEVEL, _SIMILARITY, imaging=imaging
-        )
-    except InputError:  # what is saturated leaves nothing to compare
+    costs = costs_of_bones(scene, poses, names, imaging)
+    if costs is None:
         return None
     thing = scene.objects[scene.anchor]
     rates = _rates(thing.volume.lps_from_index, thing.reference_point)

@@ -12,7 +12,8 @@ from femoreg_torch.case import Case, CaseObject, Model
 from femoreg_torch.geometry import exp_so3
 from femoreg_torch.registration import Scene
 from femoreg_torch.registration.doubts.ct import doubts_about_the_ct
-from femoreg_torch.registration.evidence.ct_shape import Amount, ct_shape
+from femoreg_torch.registration.evidence.bones import Amount
+from femoreg_torch.registration.evidence.ct_shape import ct_shape
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.volume import Volume
 

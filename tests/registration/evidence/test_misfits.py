@@ -29,7 +29,6 @@ def with_image(scene: Scene, kind: Kind, view: int, image: torch.Tensor) -> Scen
 
 def test_right_images_fit(scene: Scene) -> None:
     assert misfits(scene, TRUTH, PLAIN) == ()
-    assert doubts_about_the_images(scene, TRUTH, PLAIN) == ()
 
 
 @pytest.mark.parametrize(
@@ -40,20 +39,20 @@ def test_an_image_that_was_stored_otherwise(scene: Scene, dims: tuple[int, ...],
     other = scene.image("anatomy", 1).flip(dims).rot90(turns)
     strange = with_image(scene, "anatomy", 1, other)
     astray = TRUTH.with_view(1, exp_se3(float64(0.05, 0.3, -0.1, 20, -10, 30)) @ TRUTH.camera_from_camera1[1])
-    (found,) = (each for each in misfits(strange, astray, PLAIN) if each.kind == "anatomy")
-    assert (found.view, found.as_stored) == (1, told)
-    told_of = [doubt for doubt in doubts_about_the_images(strange, astray, PLAIN) if "view 2" in doubt]
-    assert f"{told} it does" in told_of[0]
-    assert len(told_of) == 1  # the device image of a view that was not placed is not complained of as well
+    (found,) = misfits(strange, astray, PLAIN)  # not the device image of a view that was not placed as well
+    assert (found.kind, found.view, found.as_stored) == ("anatomy", 1, told)
+    (doubt,) = doubts_about_the_images(strange, [found])
+    assert "view 2" in doubt
+    assert f"{told} it does" in doubt
 
 
 def test_an_image_that_was_inverted(scene: Scene) -> None:
     inverted = 5 - scene.image("anatomy", 1)
     fields: tuple[torch.Tensor | None, ...] = (None, torch.ones_like(inverted).bool(), None)
     strange = replace(with_image(scene, "anatomy", 1, inverted), fields={"anatomy": fields})
-    (found,) = (each for each in misfits(strange, TRUTH, PLAIN) if each.kind == "anatomy")
-    assert (found.view, found.as_stored) == (1, "with bright and dark exchanged")
-    assert "check `display` and `intensity`" in doubts_about_the_images(strange, TRUTH, PLAIN)[0]
+    (found,) = misfits(strange, TRUTH, PLAIN)
+    assert (found.kind, found.view, found.as_stored) == ("anatomy", 1, "with bright and dark exchanged")
+    assert "check `display` and `intensity`" in doubts_about_the_images(strange, [found])[0]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +69,7 @@ def test_a_device_image_that_was_stored_otherwise_than_the_other_of_its_view(
     strange = with_image(scene, "device", 2, change(scene.image("device", 2)))
     (found,) = misfits(strange, TRUTH, PLAIN)
     assert (found.kind, found.view, found.as_view, found.as_stored) == ("device", 2, None, told)
-    (doubt,) = doubts_about_the_images(strange, TRUTH, PLAIN)
+    (doubt,) = doubts_about_the_images(strange, [found])
     assert doubt.startswith("the device image of view 3 does not fit as the case tells it")
     assert f"{told} it does" in doubt
 
@@ -78,26 +77,25 @@ def test_a_device_image_that_was_stored_otherwise_than_the_other_of_its_view(
 def test_device_images_that_were_exchanged(scene: Scene) -> None:
     exchanged = with_image(scene, "device", 1, scene.image("device", 2))
     exchanged = with_image(exchanged, "device", 2, scene.image("device", 1))
-    assert [(each.kind, each.view, each.as_view) for each in misfits(exchanged, TRUTH, PLAIN)] == [
-        ("device", 1, 2),
-        ("device", 2, 1),
-    ]
-    assert "shows what the other images of view 3 show" in doubts_about_the_images(exchanged, TRUTH, PLAIN)[0]
+    found = misfits(exchanged, TRUTH, PLAIN)
+    assert [(each.kind, each.view, each.as_view) for each in found] == [("device", 1, 2), ("device", 2, 1)]
+    assert "shows what the other images of view 3 show" in doubts_about_the_images(exchanged, found)[0]
 
 
 def test_images_of_something_else(scene: Scene) -> None:
     noise = torch.rand(scene.image("anatomy", 1).shape, generator=torch.Generator().manual_seed(3))
     for kind, says in (("anatomy", "or register without that view"), ("device", "no images are exchanged")):
-        (found,) = misfits(with_image(scene, kind, 1, noise), TRUTH, PLAIN)
+        strange = with_image(scene, kind, 1, noise)
+        (found,) = misfits(strange, TRUTH, PLAIN)
         assert (found.kind, found.view, found.as_view, found.as_stored) == (kind, 1, None, None)
         assert found.similarity < 0.2 < found.in_view_1
-        assert says in doubts_about_the_images(with_image(scene, kind, 1, noise), TRUTH, PLAIN)[0]
+        assert says in doubts_about_the_images(strange, [found])[0]
 
 
 def test_poses_that_the_case_gives_are_named_where_an_image_does_not_fit(scene: Scene) -> None:
     noise = torch.rand(scene.image("anatomy", 1).shape, generator=torch.Generator().manual_seed(3))
     given = replace(with_image(scene, "anatomy", 1, noise), camera_from_camera1=TRUTH.camera_from_camera1)
-    told = doubts_about_the_images(given, TRUTH, PLAIN)[0]
+    told = doubts_about_the_images(given, misfits(given, TRUTH, PLAIN))[0]
     assert "does not fit at the pose that the case gives" in told
     assert "not the inverse" in told
 
@@ -109,4 +107,4 @@ def test_the_only_device_image_may_be_of_something_else() -> None:
     strange = with_image(make_scene(truth), "device", 0, noise)
     (found,) = misfits(strange, truth, PLAIN)
     assert (found.kind, found.view, found.as_view, found.as_stored) == ("device", 0, None, None)
-    assert "no images are exchanged" in doubts_about_the_images(strange, truth, PLAIN)[0]
+    assert "no images are exchanged" in doubts_about_the_images(strange, [found])[0]
