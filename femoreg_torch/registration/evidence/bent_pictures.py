@@ -16,14 +16,13 @@ from torch.nn import functional as F
 
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.geometry import Camera, Poses
-from femoreg_torch.optimize import LevenbergMarquardt, profile
-from femoreg_torch.registration.evidence.bones import Amount, costs_of_bones
+from femoreg_torch.optimize import profile
+from femoreg_torch.registration.evidence.bones import LEVEL, Amount, costs_of_bones, refitted
 from femoreg_torch.registration.imaging import Imaging
-from femoreg_torch.registration.objective import mean_quadratic, stage_objective
+from femoreg_torch.registration.objective import mean_quadratic
 from femoreg_torch.registration.scene import Scene
 
 Field = Callable[[Camera], Tensor]  # by how much what a picture shows is moved along columns and rows (2, H, W)
-_REFIT = LevenbergMarquardt(max_iterations=4)
 _WHOLE = 0.999  # of a pixel exposed
 
 
@@ -81,10 +80,8 @@ def bent_pictures(scene: Scene, poses: Poses, names: Sequence[str], imaging: Ima
         return ()
     views = [target.view for target in costs.targets]
     ways = _ways(views)
-    camera = costs.targets[0].camera
-    fields = [field for way in ways for field in way.fields]
-    rates = [_rates(field, camera, scene.device) for field in fields]
-    model = profile(mean_quadratic(costs.quadratics(costs.still, bends=rates)), len(fields))
+    rates = [rate for way in ways for rate in _rates(way, scene)]
+    model = profile(mean_quadratic(costs.quadratics(costs.still, bends=rates)), len(rates))
     likely, first = [], 0
     for way in ways:
         own = slice(first, first + len(way.fields))
@@ -111,29 +108,13 @@ def _looked_at_twice(
     scene: Scene, poses: Poses, names: Sequence[str], imaging: Imaging, way: Way, steps: Tensor
 ) -> Bend | None:
     """What the pictures say once they are straightened by `steps` (n,) of a way, mm; None where too little is left."""
+    rates = _rates(way, scene)
     straight, as_they_are = _straightened(scene, way, steps.tolist())
-    after = _fitted(straight, poses, names, imaging, way)
-    before = _fitted(as_they_are, poses, names, imaging, way)
+    after, before = (refitted(each, poses, names, imaging, bends=rates) for each in (straight, as_they_are))
     if after is None or before is None:
         return None
-    cost, scores, curvature = after
-    rest = scores @ torch.linalg.pinv(curvature, hermitian=True)
-    deviations = (rest - rest.mean(0)).square().sum(0).sqrt()
-    amounts = tuple(map(Amount, (steps - rest.sum(0)).tolist(), deviations.tolist()))
-    return Bend(way, amounts, (before[0] - cost) / before[0])
-
-
-def _fitted(
-    scene: Scene, poses: Poses, names: Sequence[str], imaging: Imaging, way: Way
-) -> tuple[float, Tensor, Tensor] | None:
-    """The cost with all poses refitted, and scores (T, n) and curvature (n, n) of the amounts of a way there."""
-    costs = costs_of_bones(scene, poses, names, imaging)
-    if costs is None:
-        return None
-    found = _REFIT.minimise(stage_objective(costs, costs.bodies, None), len(costs.still), 0)
-    rates = [_rates(field, costs.targets[0].camera, scene.device) for field in way.fields]
-    model = profile(mean_quadratic(costs.quadratics(found.delta, bends=rates)), len(rates))
-    return found.value, model.scores, model.curvature
+    amounts = tuple(map(Amount, (steps + after.left).tolist(), after.deviations.tolist()))
+    return Bend(way, amounts, (before.cost - after.cost) / before.cost)
 
 
 def _straightened(scene: Scene, way: Way, amounts_mm: Sequence[float]) -> tuple[Scene, Scene]:
@@ -155,9 +136,13 @@ def _straightened(scene: Scene, way: Way, amounts_mm: Sequence[float]) -> tuple[
     return replace(scene, images=scene.images | {kind: tuple(straight)}, fields=fields), replace(scene, fields=fields)
 
 
-def _rates(fields: Mapping[int, Field], camera: Camera, device: torch.device) -> dict[int, Tensor]:
-    """Of an amount in mm, px, by view (2, H, W)."""
-    return {view: field(camera).to(device) / _pixel(camera).to(device) for view, field in fields.items()}
+def _rates(way: Way, scene: Scene) -> list[dict[int, Tensor]]:
+    """Of amounts of a way in mm, px by view (2, H, W)."""
+    camera = LEVEL.camera(scene.carm.camera)
+    return [
+        {view: (field(camera) / _pixel(camera)).to(scene.device) for view, field in fields.items()}
+        for fields in way.fields
+    ]
 
 
 def _from_the_middle(camera: Camera) -> tuple[Tensor, float]:
