@@ -15,7 +15,7 @@ from femoreg_torch.registration.scene import Scene
 # stretched by 2.5 %, by 2.2 deviations. Gantries tilted by 1.5 and 4°, slides of 2 and 4 mm, and two spacings of slices
 # told as one: shears of 1.2 to 6.6 %, by 3 deviations and more, with gains of 0.006 and more; right CTs up to 1.9 % by
 # 5.3 deviations, in views that hardly tell, with gains of 0.002 at most.
-# A stretch may gain nothing, as it changes how finely a CT is looked at: down to -0.015; bones far off the truth -0.034.
+# A stretch may gain nothing, as it changes how finely a CT is looked at: down to -0.015; of bones far off, -0.034.
 _MOST_STRETCHED, _SURE_OF_STRETCH, _GAIN_OF_STRETCH = 0.008, 3.5, -0.02
 _MOST_SHEARED, _SURE_OF_SHEAR, _GAIN_OF_SHEAR = 0.012, 2.5, 0.004
 
