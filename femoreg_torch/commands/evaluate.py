@@ -23,7 +23,8 @@ def evaluate(case: Path, run: Path) -> None:
     if (case / RESULT_NAME).is_file() and not (case / "case.yaml").is_file() and (run / "case.yaml").is_file():
         raise InputError(f"{case}: is a run, and {run} is a case. Is the order `femoreg evaluate CASE RUN`?")
     console, result = Console(), read_result(run)
-    errors = write_report(read_case(case), result, run)
+    with console.status("reading the case and drawing the report"):
+        errors = write_report(read_case(case), result, run)
     if errors is None:
         console.print(f"{escape(str(case))} holds no truth, so there are no errors to tell.")
     else:

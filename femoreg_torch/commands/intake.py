@@ -64,7 +64,8 @@ def check(case: Path, *, out: Path = Path("check.png"), landmarks: Path | None =
     _check_picture(out, case)
     console = Console(soft_wrap=True)
     pixels = None if landmarks is None else read_pixels(landmarks)
-    found = check_case(case, find_start=not fast, landmarks=pixels)
+    with console.status("reading the case" if fast else "reading the case and looking for the start"):
+        found = check_case(case, find_start=not fast, landmarks=pixels)
     for fact in found.facts:
         console.print(f"  {escape(fact)}", highlight=False)
     for warning in found.warnings:

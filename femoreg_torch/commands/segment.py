@@ -72,7 +72,9 @@ def segment(
     }
     colours = {1 + n: bone.colour for n, bone in enumerate(HIP.bones)}
     heads = {side: head.centre for side, head in found.heads.items() if head.may_be_one}
-    planes = planes_through_joints(volume, found.labels, colours, heads)
+    planes = planes_through_joints(
+        volume, found.labels, colours, heads, {1 + n: b.name for n, b in enumerate(HIP.bones)}
+    )
     with temporary_files(out, beside(".json"), beside(".png")) as (labels, text, picture):
         write_labels_like(labels, found.labels, ct)
         write_json(text, about)

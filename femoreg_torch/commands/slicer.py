@@ -25,15 +25,15 @@ def slicer(run: Path, *, case: Path | None = None, out: Path | None = None) -> N
     from femoreg_torch.files import check_new_folder
     from femoreg_torch.neighbours.slicer import SCENE_FOLDER, SCENE_NAME, outside_ct, write_scene
 
-    result = read_result(run)
+    console, result = Console(), read_result(run)
     of = case_folder(case_of(run, result, case))
     folder = run / SCENE_FOLDER if out is None else out
     check_new_folder(folder, of)
     content = read_case(of)
-    check_fits(content, result)
-    check_made_of(content, result)
-    check_plan_fits(content, result)
-    with new_folder(folder) as built:
+    with console.status("writing the scene"), new_folder(folder) as built:
+        check_fits(content, result)
+        check_made_of(content, result)
+        check_plan_fits(content, result)
         write_scene(built, content, result, standing=folder)
     if outside_ct(content, result) and (content.ct_path is not None or content.landmarks):
         Console(stderr=True).print(
@@ -42,4 +42,4 @@ def slicer(run: Path, *, case: Path | None = None, out: Path | None = None) -> N
             highlight=False,
             soft_wrap=True,
         )
-    Console().print(f"Scene written to {folder / SCENE_NAME}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"Scene written to {folder / SCENE_NAME}", markup=False, highlight=False, soft_wrap=True)

@@ -236,9 +236,11 @@ def planes_of(seen: SeenAnatomy, case: Case | None) -> Picture | None:
     marks = dict(seen.landmarks)
     if case is not None and case.plan is not None:
         marks["entry"] = case.plan.entry_point
-    colours = {}
+    colours, ids = {}, {}
     if seen.bones is not None and seen.anatomy is not None:
         names = [bone.name for bone in seen.anatomy.bones if bone.name in seen.bones.ids]
         colours = {seen.bones.ids[name]: seen.anatomy.bone(name).colour for name in names}
+        ids = {seen.bones.ids[name]: name for name in names}
     head = seen.landmarks.get(femoral_head(case.side)) if case is not None and case.side is not None else None
-    return three_planes(seen.ct, None if seen.bones is None else seen.bones.labels, colours, marks, head)
+    labels = None if seen.bones is None else seen.bones.labels
+    return three_planes(seen.ct, labels, colours, marks, head, names=ids)

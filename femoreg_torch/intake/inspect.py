@@ -270,7 +270,8 @@ def _labels(volume: Volume, names: Mapping[str, tuple[int, ...]], path: Path, wa
         warnings += cut_bones(whole, table, list(table))
     tints = {n: HIP.bone(b).colour for b, n in table.items() if b in HIP.bone_names}
     colours = {n: tints.get(n, _TINTS[k % len(_TINTS)]) for k, n in enumerate(ids)}
-    return Findings("label map", tuple(facts), tuple(warnings), three_planes(None, whole, colours, {}))
+    shown = {n: f"{n} {name_of.get(n, '')}" for n in ids}
+    return Findings("label map", tuple(facts), tuple(warnings), three_planes(None, whole, colours, {}, names=shown))
 
 
 def _points(path: Path) -> Findings:

@@ -3,7 +3,7 @@
 And X-ray images side by side, as they are stored.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ _JOINT_MM = 55.0  # to all sides of a femoral head's centre: the whole socket
 _CELL_PX, _COLUMNS = 300, 3  # of images side by side
 _ENDS_PERCENT = (0.5, 99.5)  # of the pixels, that set the window of an image
 _TINT = 0.35
+_LEGEND_PX, _LINE_PX, _MOST_NAMES = 150, 18, 20
 _NEAR_MM = 12.0  # of a point before or behind a plane
 _WHITE, _YELLOW, _DIM = (255, 255, 255), (60, 230, 255), (40, 110, 120)
 
@@ -33,12 +34,14 @@ def three_planes(
     marks: Mapping[str, Tensor],
     centre: Tensor | None = None,
     caption: str = "",
+    names: Mapping[int, str] | None = None,
 ) -> Picture:
     """Axial, coronal and sagittal plane through `centre` (3,), LPS mm (by default the middle of what is labelled).
 
     `grey` is a CT in HU (anything else is shown from its least to its greatest value), `labels` a map on the same grid
     with RGB `colours` of its ids, `marks` points (3,) by name, LPS mm: those near a plane are named, others dim there.
-    One of `grey` and `labels` must be there. `caption` stands before the name of each plane.
+    One of `grey` and `labels` must be there. `caption` stands before the name of each plane. Beside the planes the
+    `names` of ids stand in their colours, the first twenty.
     """
     volume = grey if grey is not None else labels
     assert volume is not None
@@ -67,19 +70,25 @@ def three_planes(
                 put_words(panel, mark, (round(column) + 5, round(row) - 4), 0.35, colour)
         left, right = ("front", "back") if axis == 0 else ("R", "L")
         panels.append(_captioned(panel, f"{caption}{name}", left, right))
+    if names:
+        panels.append(_legend([(name, colours[n]) for n, name in names.items() if n in colours][:_MOST_NAMES]))
     height = max(panel.shape[0] for panel in panels)
     return np.hstack([cv2.copyMakeBorder(p, 0, height - p.shape[0], 0, 6, cv2.BORDER_CONSTANT) for p in panels])
 
 
 def planes_through_joints(
-    grey: Volume, labels: Volume, colours: Mapping[int, tuple[int, int, int]], heads: Mapping[str, Tensor]
+    grey: Volume,
+    labels: Volume,
+    colours: Mapping[int, tuple[int, int, int]],
+    heads: Mapping[str, Tensor],
+    names: Mapping[int, str] | None = None,
 ) -> Picture:
     """Three planes of all through the middle of the femoral heads, and below them, for each head, of its joint alone.
 
     `heads` are centres (3,), LPS mm, by side; the rest is as for `three_planes`.
     """
     middle = torch.stack(list(heads.values())).mean(0) if heads else None
-    picture = three_planes(grey, labels, colours, {}, middle)
+    picture = three_planes(grey, labels, colours, {}, middle, names=names)
     for side, centre in heads.items():
         around = [_around(volume, centre) for volume in (grey, labels)]
         below = three_planes(around[0], around[1], colours, {}, centre, f"{side} hip, ")
@@ -170,6 +179,14 @@ def _window(grey: Volume) -> tuple[float, float]:
     if low < _WINDOW_HU[0] and high > _WINDOW_HU[1] / 4:
         return _WINDOW_HU
     return low, max(high, low + 1e-6)
+
+
+def _legend(names: Sequence[tuple[str, tuple[int, int, int]]]) -> Picture:
+    """Names in RGB colours, one below the other."""
+    panel = np.zeros((_LINE_PX * (len(names) + 1), _LEGEND_PX, 3), np.uint8)
+    for line, (name, (red, green, blue)) in enumerate(names, 1):
+        put_words(panel, name, (6, _LINE_PX * line), 0.45, (blue, green, red))
+    return panel
 
 
 def _captioned(panel: Picture, name: str, left: str, right: str) -> Picture:

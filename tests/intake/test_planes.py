@@ -22,3 +22,13 @@ def test_a_point_is_named_on_the_plane_that_it_lies_near_and_dim_on_the_others()
     axial, coronal, sagittal = (yellow(slice(426 * n, 426 * n + 420), mark) for n in range(3))
     assert axial > 20
     assert coronal == sagittal == 0
+
+
+def test_ids_are_named_in_their_colours_beside_the_planes() -> None:
+    labels = torch.zeros(60, 60, 60, dtype=torch.int32)
+    labels[20:40, 20:40, 20:40] = 7
+    volume = Volume(labels, axis_aligned((2.0, 2.0, 2.0), (0.0, 0.0, 0.0)))
+    without, beside = (three_planes(None, volume, {7: (250, 20, 30)}, {}, names=names) for names in (None, {7: "hip"}))
+    np.testing.assert_array_equal(beside[:, : without.shape[1]], without)
+    blue, green, red = np.moveaxis(beside[:, without.shape[1] :].astype(int), 2, 0)
+    assert ((red > 200) & (green < 60) & (blue < 60)).sum() > 20
