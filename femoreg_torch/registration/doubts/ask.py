@@ -21,6 +21,7 @@ from femoreg_torch.registration.doubts.movement import doubts_about_motion, expl
 from femoreg_torch.registration.doubts.plan import doubts_about_the_guide, doubts_about_the_plan
 from femoreg_torch.registration.doubts.shape import doubts_about_handedness, doubts_about_rigidity
 from femoreg_torch.registration.evidence.covariance import PoseCovariance
+from femoreg_torch.registration.evidence.fitted_alone import gain_alone
 from femoreg_torch.registration.evidence.misfits import misfits
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.quality import Limits
@@ -40,10 +41,13 @@ def doubts(
         plan = *doubts_about_the_plan(case, scene), *doubts_about_the_guide(case, poses)
         return (*told.contradictions, *doubts_about_units(case, told, True), *strange, *plan)
     clear = scene.where_unsaturated()
+    given = scene.camera_from_camera1 is not None
     geometry: list[Callable[[], tuple[str, ...]]] = [
         lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
-        lambda: doubts_about_motion(covariance, limits, given=scene.camera_from_camera1 is not None),
+        lambda: doubts_about_motion(
+            covariance, limits, lambda drift: gain_alone(scene, poses, drift, imaging), given=given
+        ),
     ]
     questions: list[Callable[[], tuple[str, ...]]] = [
         # What is shown of such a CT, or in such pictures, seems to have moved or bent as well.

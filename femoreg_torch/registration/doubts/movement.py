@@ -1,7 +1,10 @@
 """Anatomy and devices that moved between the images, in words."""
 
+from collections.abc import Callable
+
 from femoreg_torch.case.quality import largest
 from femoreg_torch.registration.evidence.covariance import PoseCovariance
+from femoreg_torch.registration.evidence.fitted_alone import Gain
 from femoreg_torch.registration.evidence.motion import GuideDrift, JointTurn, MotionBetween
 from femoreg_torch.registration.quality import Limits
 
@@ -12,11 +15,12 @@ from femoreg_torch.registration.quality import Limits
 # gained 0.006 to 0.15 in five more; of six right ones at most 0.0007, where one seemed 1.6 mm off by 3.2 deviations.
 _GAIN_OF_MOTION = 0.001
 _MOST_MOTION_MM, _MOST_MOTION_DEG, _SURE_OF_MOTION, _SURE_IN_ALL = 0.3, 0.3, 3.0, 2.2
-# Of a device in one view, beside the others: what its moving gains of similarity. Where it was held still: at most
-# 0.0004, on images of other simulators 0.0015 and 2.2 deviations, 0.0018 and 2.9, 0.0009 and 3.2 (one whose device was
-# another: 0.0011 and 3.3). Where it moved by 1.2 mm and 0.8° between the views: 0.0014 to 0.0057, in all of eight at
-# least 3.4 deviations; on images of another simulator 0.0031 and 2.4.
-_GAIN_OF_DRIFT, _GAIN_OF_SURE_DRIFT = 0.002, 0.001
+# Of a device in one view, beside the others, that would gain so much by a step of Newton: what fitting it there by
+# itself gains. Where it moved by 1.2 mm and 0.8° between the views, in six of six at least a share of 0.012; where its
+# handle sagged by 3° in one view of another simulator, 0.007, by 0.0024. Of 16 right ones of three simulators at most
+# 0.002, by 0.0005, though the step of one had promised 0.0020 there.
+_WORTH_FITTING = 0.0009
+_SHARE_OF_DRIFT, _GAIN_OF_DRIFT = 0.005, 0.001
 # Of a tool along and about its guide in one view alone. Of 39 right ones of three simulators slides were at most 0.3 mm
 # and gained 0.00015; turns at most 0.8°, and 2.5° where they gained less than 0.00005. Slides of 1 and 1.5 mm were
 # measured as 0.7 to 1.4 mm, by 5 deviations and more, and gained 0.0016; turns of 4 to 8° as 2.5 to 5°, by 1.5 to 2.9
@@ -40,15 +44,18 @@ _MOST_JOINT_TURN_DEG, _SURE_OF_JOINT_TURN, _GAIN_OF_JOINT_TURN = 0.8, 3.0, 0.000
 _GAIN_OF_NO_CARM = 0.006
 
 
-def doubts_about_motion(covariance: PoseCovariance, limits: Limits, *, given: bool = False) -> tuple[str, ...]:
+def doubts_about_motion(
+    covariance: PoseCovariance, limits: Limits, alone: Callable[[MotionBetween], Gain], *, given: bool = False
+) -> tuple[str, ...]:
     """Anatomy that lies elsewhere in images of another kind, or a device that moved between the views, in words.
 
-    Where the poses of the C-arm were `given`, these may be off as well.
+    `alone` tells what fitting a device in one view by itself gains, see `evidence.fitted_alone`. Where the poses of the
+    C-arm were `given`, these may be off as well.
 
     Where both explain the images, what explains them better. A single bone or device counts if it is sure by itself:
     the depth of a bone in one view is so open that it may gain more where a device has moved.
     """
-    moved = [each for each in covariance.drifts if _has_drifted(each)]
+    moved = [each for each in covariance.drifts if _has_drifted(each, alone)]
     if any(_has_moved(each) for each in covariance.motions):
         moved.append(max(covariance.motions, key=lambda each: each.gain))
     if not moved:
@@ -124,10 +131,13 @@ def _has_moved(found: MotionBetween) -> bool:
     return far and found.sureness > sure and found.gain > _GAIN_OF_MOTION
 
 
-def _has_drifted(found: MotionBetween) -> bool:
+def _has_drifted(found: MotionBetween, alone: Callable[[MotionBetween], Gain]) -> bool:
     if found.kind is None:
         return found.gain > _GAIN_OF_BONE_DRIFT
-    return found.gain > _GAIN_OF_DRIFT or (found.gain > _GAIN_OF_SURE_DRIFT and found.sureness > _SURE_OF_MOTION)
+    if found.gain <= _WORTH_FITTING:
+        return False
+    gain = alone(found)
+    return gain.share > _SHARE_OF_DRIFT or gain.cost > _GAIN_OF_DRIFT
 
 
 def _has_turned(found: JointTurn) -> bool:

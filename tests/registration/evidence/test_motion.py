@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -11,7 +12,9 @@ from torch import Tensor
 from femoreg_torch.geometry import about_point, exp_se3
 from femoreg_torch.registration.doubts.movement import doubts_about_guides, doubts_about_motion, explains_the_carm
 from femoreg_torch.registration.evidence.covariance import pose_covariance
+from femoreg_torch.registration.evidence.fitted_alone import Gain, gain_alone
 from femoreg_torch.registration.evidence.motion import GuideDrift, JointTurn, MotionBetween
+from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.quality import Limits
 from femoreg_torch.registration.roundness import Axis
@@ -37,9 +40,17 @@ def _scene(moving: tuple[str, ...], views: tuple[int, ...] = (0, 1, 2)) -> Scene
     return replace(still, images=still.images | {"device": mixed})
 
 
+def _never(drift: MotionBetween) -> Gain:
+    raise AssertionError(f"nothing here is worth a fit: {drift}")
+
+
+def _alone(scene: Scene, drift: MotionBetween) -> Gain:
+    return gain_alone(scene, true_poses(), drift, PLAIN)
+
+
 def _motions(scene: Scene) -> tuple[tuple[MotionBetween, ...], tuple[str, ...]]:
     covariance = pose_covariance(scene, true_poses(), _LEVEL, GradNcc(1))
-    return covariance.motions, doubts_about_motion(covariance, LIMITS)
+    return covariance.motions, doubts_about_motion(covariance, LIMITS, _never)
 
 
 def test_no_motion_is_told_where_nothing_moved() -> None:
@@ -79,7 +90,7 @@ def test_one_kind_of_images_tells_nothing_of_motion() -> None:
     objects = {name: scene.objects[name] for name in ("pelvis", "femur")}
     covariance = pose_covariance(replace(scene, objects=objects), alone, _LEVEL, GradNcc(1))
     assert covariance.motions == ()
-    assert doubts_about_motion(covariance, LIMITS) == ()
+    assert doubts_about_motion(covariance, LIMITS, _never) == ()
 
 
 @pytest.mark.parametrize(
@@ -94,7 +105,7 @@ def test_all_views_together_need_less_certainty(views: tuple[int, ...], sigmas: 
     motion = torch.tensor([0.0, 0.0, 1.8, 0.0, 0.0, 0.4], dtype=torch.float64)
     found = MotionBetween("device", views, ("femur",), motion, motion.abs() / sigmas + 1e-9, gain)
     covariance = replace(pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(found,))
-    assert len(doubts_about_motion(covariance, LIMITS)) == told
+    assert len(doubts_about_motion(covariance, LIMITS, _never)) == told
 
 
 def test_a_device_that_moved_between_the_views_is_told() -> None:
@@ -109,7 +120,7 @@ def test_a_device_that_moved_between_the_views_is_told() -> None:
         covariance = pose_covariance(scene, truth, _LEVEL, GradNcc(1))
         of_device = [drift for drift in covariance.drifts if drift.objects == ("device",)]
         assert [drift.views for drift in of_device] == [(0,), (1,), (2,)]
-        said = doubts_about_motion(covariance, LIMITS)
+        said = doubts_about_motion(covariance, LIMITS, partial(_alone, scene))
         assert len(said) == told, said
     assert "in the device image of view 2, the device lies elsewhere" in said[0]
     best = max(covariance.drifts, key=lambda drift: drift.gain)
@@ -127,7 +138,7 @@ def test_a_leg_that_turned_between_the_views_is_told() -> None:
         covariance = pose_covariance(scene, truth, _LEVEL, GradNcc(1))
         of_femur = [drift for drift in covariance.drifts if drift.objects == ("femur",)]
         assert [drift.views for drift in of_femur] == [(0,), (1,), (2,)]
-        said = doubts_about_motion(covariance, LIMITS)
+        said = doubts_about_motion(covariance, LIMITS, _never)
         assert len(said) == told, said
     assert "in view 3, the femur lies" in said[0]
     assert float(of_femur[2].motion[2]) == pytest.approx(3.0, abs=0.6)
@@ -160,7 +171,7 @@ def test_a_turn_in_a_joint_is_told_that_is_far_and_sure_and_explains_something(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)),
         motions=(), drifts=(), guide_drifts=(), joint_turns=(turn,),
     )  # fmt: skip
-    said = doubts_about_motion(covariance, LIMITS)
+    said = doubts_about_motion(covariance, LIMITS, _never)
     assert len(said) == told
     assert all("in view 3, the femur is turned by 1.3° in its joint" in one for one in said)
 
@@ -172,17 +183,25 @@ def test_a_bone_must_gain_more_than_a_device_to_have_drifted(gain: float, told: 
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(), drifts=(drift,)
     )
-    assert len(doubts_about_motion(covariance, LIMITS)) == told
+    assert len(doubts_about_motion(covariance, LIMITS, _never)) == told
 
 
-@pytest.mark.parametrize(("gain", "sigmas", "told"), [(0.0025, 1.1, 1), (0.0012, 3.5, 1), (0.0015, 2.2, 0)])
-def test_a_drift_is_told_by_what_it_gains_and_how_sure_it_is(gain: float, sigmas: float, told: int) -> None:
+@pytest.mark.parametrize(
+    ("step", "alone", "told"),
+    [
+        (0.0020, Gain(0.0005, 0.002), 0),  # a right one, whose step promised much
+        (0.0010, Gain(0.0024, 0.007), 1),  # a handle that sagged
+        (0.0011, Gain(0.0008, 0.022), 1),  # of little cost, and much of that
+        (0.0005, Gain(0.0024, 0.007), 0),  # not worth a fit
+    ],
+)
+def test_a_drift_is_told_by_what_fitting_it_alone_gains(step: float, alone: Gain, told: int) -> None:
     motion = torch.tensor([0.0, 0.0, 0.5, 0.9, 0.4, 0.0], dtype=torch.float64)
-    drift = MotionBetween("device", (1,), ("device",), motion, motion.abs() / sigmas + 1e-9, gain)
+    drift = MotionBetween("device", (1,), ("device",), motion, motion.abs() / 3 + 1e-9, step)
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(), drifts=(drift,)
     )
-    assert len(doubts_about_motion(covariance, LIMITS)) == told
+    assert len(doubts_about_motion(covariance, LIMITS, lambda _: alone)) == told
 
 
 def _held(way: Tensor, view: int) -> Scene:
@@ -251,7 +270,7 @@ def test_what_is_far_sure_and_explains_something_is_told(
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), drifts=(), guide_drifts=(found,)
     )
-    told = doubts_about_motion(covariance, LIMITS)
+    told = doubts_about_motion(covariance, LIMITS, _never)
     assert len(told) == (words is not None)
     assert words is None or words in told[0]
 
@@ -264,7 +283,7 @@ def test_a_turn_in_one_view_is_not_told_where_the_images_leave_the_rotation_open
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), drifts=(), guide_drifts=(found,)
     )
-    assert len(doubts_about_motion(covariance, Limits(most_deviation_deg=most_deg))) == told
+    assert len(doubts_about_motion(covariance, Limits(most_deviation_deg=most_deg), _never)) == told
 
 
 @pytest.mark.parametrize(("gain", "told"), [(0.0025, False), (0.012, True)])

@@ -1,0 +1,46 @@
+"""A device that seems to lie elsewhere in one view is fitted in that image by itself, all else staying where it is.
+
+A step of Newton says how far it would move, and what that would gain, as `registration.evidence.motion` has it. Where
+the image hardly bends the cost, it says too much. Fitted, the device tells what moving it really gains.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from femoreg_torch.geometry import Poses
+from femoreg_torch.optimize import LevenbergMarquardt
+from femoreg_torch.registration.costs import image_costs
+from femoreg_torch.registration.evidence.motion import MotionBetween
+from femoreg_torch.registration.imaging import Imaging
+from femoreg_torch.registration.level import Level
+from femoreg_torch.registration.objective import stage_objective
+from femoreg_torch.registration.scene import Body, Scene, reference_point_in_view
+from femoreg_torch.similarity import GradNcc
+
+_LEVEL = Level(pixel_mm=1.55, step_mm=0.5)
+_SIMILARITY = GradNcc(patch_radius=5)
+_FIT = LevenbergMarquardt(max_iterations=12)
+_SCALE = (math.pi / 180,) * 3 + (1.0,) * 3  # rad and mm: one unit of a motion
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What fitting by itself gains."""
+
+    cost: float  # by so much the image costs less
+    share: float  # of what it cost before
+
+
+def gain_alone(scene: Scene, poses: Poses, drift: MotionBetween, imaging: Imaging) -> Gain:
+    """What is gained where the objects of a drift are fitted in its image of one kind and view, by themselves."""
+    assert drift.kind is not None
+    name, view = drift.objects[0], drift.views[0]
+    scale = torch.tensor(_SCALE, dtype=torch.float64)
+    body = Body(drift.objects, 0, reference_point_in_view(scene, poses, name, 0), scale)
+    images = [(drift.kind, view)]
+    costs = image_costs(scene, poses, (body,), list(poses.camera1_from), images, _LEVEL, _SIMILARITY, imaging=imaging)
+    before = float(costs(costs.still[None]).mean())
+    found = _FIT.minimise(stage_objective(costs, costs.bodies, None), len(costs.still), 0)
+    return Gain(before - found.value, (before - found.value) / before)
