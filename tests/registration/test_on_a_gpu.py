@@ -34,12 +34,16 @@ from femoreg_torch.commands.main import main
 from femoreg_torch.commands.telling import tell_device
 from femoreg_torch.detect import detect, load_network
 from femoreg_torch.drr import chosen_device
-from femoreg_torch.geometry import centred_camera, first_view_only
+from femoreg_torch.geometry import Poses, centred_camera, first_view_only
 from femoreg_torch.optimize import LevenbergMarquardt, SmoothObjective
 from femoreg_torch.registration import BodyPlan, Level, OrbitSearch, Plan, Scene, Stage, run_plan
 from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.doubts.device import doubts_about_the_models
+from femoreg_torch.registration.evidence.bent_pictures import bent_pictures
+from femoreg_torch.registration.evidence.ct_shape import ct_shape
+from femoreg_torch.registration.evidence.fitted_alone import gain_alone
 from femoreg_torch.registration.evidence.handedness import handedness
+from femoreg_torch.registration.evidence.motion import MotionBetween
 from femoreg_torch.registration.evidence.rigidity import bend, images_of
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.materials.calibration import Calibration
@@ -192,6 +196,46 @@ def test_a_plan_ends_where_it_ends_on_the_cpu(scene: Scene, gpu: PretendedGpu | 
     assert bent[0] is not None
     assert bent[1] is not None
     assert bent[1].apart_mm == pytest.approx(bent[0].apart_mm, abs=0.02)
+
+
+def test_what_is_looked_at_twice_is_as_on_the_cpu(scene: Scene, gpu: PretendedGpu | None) -> None:
+    """Of bones 2 % too short, of pictures of which one half lies lower, and of a device that seems to have moved."""
+    squeezed = torch.eye(4, dtype=torch.float64)
+    squeezed[2, 2] = 0.98
+    objects = dict(scene.objects)
+    for name in ("pelvis", "femur"):
+        volume = objects[name].volume
+        objects[name] = replace(objects[name], volume=replace(volume, lps_from_index=squeezed @ volume.lps_from_index))
+    halves = tuple(
+        None if image is None else torch.cat([image[:, :44], image[:, 44:].roll(1, 0)], 1)
+        for image in scene.images["anatomy"]
+    )
+    squeezed_ct = replace(scene, objects=objects)
+    stretch, also = (
+        {each.way: each.amount.value for each in ct_shape(s, TRUTH, ("pelvis", "femur"), PLAIN)}
+        for s in (squeezed_ct, squeezed_ct.to(CUDA))
+    )
+    assert "stretch" in stretch
+    assert also == pytest.approx(stretch, rel=0.05, abs=2e-4)
+    here = replace(scene, images=scene.images | {"anatomy": halves})
+    there = here.to(CUDA)
+    bends, also_bent = (
+        {bend.way.name: bend.amounts[-1].value for bend in bent_pictures(s, TRUTH, ("pelvis", "femur"), PLAIN)}
+        for s in (here, there)
+    )
+    assert "columns" in bends
+    assert also_bent == pytest.approx(bends, rel=0.05, abs=0.02)
+    nowhere = torch.ones(6, dtype=torch.float64)
+    drift = MotionBetween("device", (1,), ("device",), nowhere, nowhere, 1.0)
+    alone = [gain_alone(s, off_by_a_little(TRUTH), drift, PLAIN).cost for s in (here, there)]
+    assert alone[0] > 0.01
+    assert alone[1] == pytest.approx(alone[0], rel=0.01)
+
+
+def off_by_a_little(poses: Poses) -> Poses:
+    return poses.with_object(
+        "device", off(poses.camera1_from["device"], REFERENCE_POINTS["device"], (2, 1, -1), (2, -2, 3))
+    )
 
 
 def test_a_stage_waits_once_per_evaluation(scene: Scene, gpu: PretendedGpu | None) -> None:
