@@ -73,7 +73,7 @@ def bent_pictures(scene: Scene, poses: Poses, names: Sequence[str], imaging: Ima
 
     A step of Newton in the amounts of each way, with the poses refitted. Then the pictures are straightened by these,
     the poses refitted by what they show, and the rest is added. Deviations are those of the sandwich estimator over
-    tiles there, see `registration.evidence.covariance`. None where fewer than two views show the anchor.
+    tiles there, see `registration.evidence.covariance`. Nothing where fewer than two views show the anchor.
     """
     costs = costs_of_bones(scene, poses, names, imaging)
     if costs is None:

@@ -44,7 +44,7 @@ def ct_shape(scene: Scene, poses: Poses, names: Sequence[str], imaging: Imaging)
 
     A step of Newton along each way by itself, all poses refitted. Then the bones are deformed by these, the poses
     refitted, and the rest is added. Deviations are those of the sandwich estimator over tiles there, see
-    `registration.evidence.covariance`. None where fewer than two views show the anchor.
+    `registration.evidence.covariance`. Nothing where fewer than two views show the anchor.
     """
     costs = costs_of_bones(scene, poses, names, imaging)
     if costs is None:
