@@ -51,12 +51,13 @@ def _check_unit(unit: Any, where: str) -> None:
         raise InputError(f"{where}: the unit must be mm, found {shortened(unit)}. Convert the points.")
 
 
-def _plain_points(content: dict[str, Any], path: Path) -> list[_Given]:
+def _plain_points(content: dict[str, Any], path: Path, example: str) -> list[_Given]:
+    """The points of our own format; `example` is a name that one may have."""
     for key in ("space", "unit", "landmarks"):
         if key not in content:
             raise InputError(
                 f"{path}: `{key}` is missing. Either 3D Slicer markups were expected or "
-                '{"space": "LPS", "unit": "mm", "landmarks": {"FH-l": [x, y, z], …}}.'
+                f'{{"space": "LPS", "unit": "mm", "landmarks": {{"{example}": [x, y, z], …}}}}.'
             )
     _check_unit(content["unit"], f"{path}, unit")
     if not isinstance(content["landmarks"], dict):
@@ -159,7 +160,7 @@ def read_landmarks(path: Path, known: Sequence[str] | None = HIP.landmark_names)
     told = "" if known is None else f" Known names: {', '.join(known)}."
     spelt = {} if known is None else {_plain_name(name): name for name in known}
     found: dict[str, Tensor] = {}
-    for label, point in _points(path):
+    for label, point in _points(path, next(iter(known or HIP.landmark_names))):
         name = label if known is None else spelt.get(_plain_name(label), "")
         if not name:
             raise InputError(f"{path}: unknown landmark {shortened(label)}.{told}")
@@ -180,7 +181,7 @@ def _plain_name(text: str) -> str:
     return "".join(letter for letter in text.lower() if letter not in " _-")
 
 
-def _points(path: Path) -> list[tuple[str, Tensor]]:
+def _points(path: Path, example: str) -> list[tuple[str, Tensor]]:
     """Name and position (3,), LPS mm, of every point in a file, in its order. Raises `InputError`."""
     if path.suffix.lower() == ".fcsv":
         points = _fcsv_points(path)
@@ -188,7 +189,7 @@ def _points(path: Path) -> list[tuple[str, Tensor]]:
         points = _csv_points(path)
     else:
         content = read_json(path, with_nan=True)  # of a point that was not placed, or a measurement without a value
-        points = (_slicer_points if "markups" in content else _plain_points)(content, path)
+        points = _slicer_points(content, path) if "markups" in content else _plain_points(content, path, example)
     found = []
     for number, point in enumerate(points, 1):
         name = str(point.label).strip() if isinstance(point.label, str | int | float) else ""
@@ -206,7 +207,7 @@ def read_path_points(path: Path) -> tuple[Tensor, Tensor | None]:
     the ends of a line of 3D Slicer are. Raises `InputError` for other numbers of points.
     """
     path = Path(path)
-    points = _points(path)
+    points = _points(path, "entry")
     entries = [point for name, point in points if "entry" in name.lower()]
     targets = [point for name, point in points if "target" in name.lower()]
     if not entries and not targets and len(points) in (1, 2):

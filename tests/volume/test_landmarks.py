@@ -1,6 +1,7 @@
 """Landmark files in three formats, and all that may be wrong with them."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -218,3 +219,10 @@ def test_a_name_that_nobody_would_write_is_not_repeated_whole(tmp_path: Path) ->
         with pytest.raises(InputError) as told:
             read_landmarks(path, known=None)
         assert len(str(told.value)) < 300 + len(str(path))
+
+
+def test_the_example_has_a_name_that_is_known(tmp_path: Path) -> None:
+    path = tmp_path / "points.json"
+    path.write_text(json.dumps({"tip": [0, 0, 1]}), encoding="utf-8")
+    with pytest.raises(InputError, match=re.escape('"landmarks": {"tip": [x, y, z], …}')):
+        read_landmarks(path, ("tip", "base"))
