@@ -12,8 +12,8 @@ from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import CameraChange, Poses, Uncertainty, about_point, exp_se3, rigid
 from femoreg_torch.optimize import LevenbergMarquardt, Quadratic
 from femoreg_torch.registration.costs import image_costs
-from femoreg_torch.registration.doubts.carm import doubts_about_the_carm
-from femoreg_torch.registration.evidence.covariance import pose_covariance
+from femoreg_torch.registration.doubts.carm import _common_shift, doubts_about_the_carm
+from femoreg_torch.registration.evidence.covariance import IntrinsicsEstimate, pose_covariance
 from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, doubted, doubts
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_quadratic, stage_objective
@@ -295,6 +295,39 @@ def test_a_principal_point_that_refinement_moved_far_is_told(scene: Scene, shift
     told = doubts_about_the_carm(scene, poses.with_changes((still, shifted, still)), covariance, Limits(), AS_SEEN)
     assert len(told) == doubted
     assert all("principal point of view 2 by 2.4 mm" in sentence for sentence in told)
+
+
+@pytest.mark.parametrize(
+    ("x_of_views", "deviation", "doubted"),
+    [
+        ((-2.3, -1.7, -2.0), 0.77, True),  # 12 mm off in all views, of which the images see a part
+        ((-2.3, 1.7, -2.0), 0.77, False),  # each view asks for something else
+        ((-0.2, -1.0, -0.4), 0.8, False),  # a right file
+        ((-1.0, -1.0, -1.0), 0.1, False),  # sure, but no more than the file's own deviation
+    ],
+)
+def test_a_shift_of_all_principal_points_alike_is_told(
+    scene: Scene, x_of_views: tuple[float, ...], deviation: float, doubted: bool
+) -> None:
+    poses = true_poses()
+    covariance = final_covariance(scene, poses)
+    mean = torch.zeros_like(covariance.intrinsics.mean)
+    mean[1::2] = torch.tensor(x_of_views)
+    found = replace(covariance, intrinsics=IntrinsicsEstimate(mean, torch.full_like(mean, deviation)))
+    told = doubts_about_the_carm(scene, poses, found, Limits(), AS_SEEN)
+    assert len(told) == doubted
+    assert all("the images of all views fit principal points some (-3, 0) pixels" in sentence for sentence in told)
+
+
+def test_a_common_shift_is_what_images_say_without_the_file() -> None:
+    """A prior of deviation one, and two views that ask for 3 and 5 with deviations of 0.5 and 1."""
+    asked, own = torch.tensor([3.0, 5.0]), torch.tensor([0.5, 1.0])
+    together = 1 / (1 + own**-2)
+    mean, deviation = torch.zeros(5), torch.ones(5)
+    mean[1::2], deviation[1::2] = together * asked * own**-2, together.sqrt()
+    shift, sureness = _common_shift(IntrinsicsEstimate(mean, deviation))
+    assert shift.tolist() == pytest.approx([(3 / 0.25 + 5) / (4 + 1), 0.0], abs=1e-5)
+    assert sureness == pytest.approx(17 / 5 * 5**0.5, rel=1e-5)
 
 
 @pytest.mark.parametrize(("factor", "doubted"), [(1.05, False), (1.107, True), (0.93, True)])
