@@ -319,6 +319,23 @@ def test_a_shift_of_all_principal_points_alike_is_told(
     assert all("the images of all views fit principal points some (-3, 0) pixels" in sentence for sentence in told)
 
 
+def test_a_file_that_says_how_uncertain_it_is_is_not_doubted_within_that(scene: Scene) -> None:
+    """The images ask for 10 mm, and the file is uncertain by 2 or by 10 mm; and a file that is sure."""
+    covariance = final_covariance(scene, true_poses())
+    sure = replace(scene, carm=replace(scene.carm, uncertainty=Uncertainty(0.0, 0.0)))
+    assert doubts_about_the_carm(sure, true_poses(), final_covariance(sure, true_poses()), Limits(), AS_SEEN) == ()
+    for principal_point_mm, sentences in ((2.0, 1), (10.0, 0)):
+        own = replace(scene.carm.assumed_uncertainty, principal_point_mm=principal_point_mm)
+        asked, deviation = 10.0 / principal_point_mm, 2.0 / principal_point_mm  # of each view, without the file
+        precision = deviation**-2
+        mean = torch.zeros_like(covariance.intrinsics.mean)
+        mean[1::2] = asked * precision / (1 + precision)
+        found = IntrinsicsEstimate(mean, torch.full_like(mean, (1 + precision) ** -0.5))
+        uncertain = replace(scene, carm=replace(scene.carm, uncertainty=own))
+        told = doubts_about_the_carm(uncertain, true_poses(), replace(covariance, intrinsics=found), Limits(), AS_SEEN)
+        assert len(told) == sentences
+
+
 def test_a_common_shift_is_what_images_say_without_the_file() -> None:
     """A prior of deviation one, and two views that ask for 3 and 5 with deviations of 0.5 and 1."""
     asked, own = torch.tensor([3.0, 5.0]), torch.tensor([0.5, 1.0])

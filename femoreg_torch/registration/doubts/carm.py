@@ -21,9 +21,10 @@ ORBIT_DEG = 100.0
 # deviations), at most 0.5 where the source distance alone was wrong.
 _MOST_SHIFT = 0.9
 _NO_DEVIATION = 1e-9
-# Of a shift of all principal points alike, by the images of all views together: mm, and deviations. Where all were told
-# 12 mm off, two of two: 5 and 10 mm, by 4.0 and 7.1. Of 16 right files, of three simulators, at most 3.1 deviations.
-_MOST_COMMON_SHIFT_MM, _SURE_OF_COMMON_SHIFT = 3.0, 3.6
+# Of a shift of all principal points alike, by the images of all views together: mm, of the file's standard deviation,
+# and by so many of the images' own. Where all were told 12 mm off, two of two: 5 and 10 mm, by 4.0 and 7.1. Of 16 right
+# files, of three simulators, by at most 3.1. Who says that a file is uncertain by 10 mm is not told of 5.
+_MOST_COMMON_SHIFT_MM, _MOST_COMMON_SHIFT, _SURE_OF_COMMON_SHIFT = 3.0, 1.5, 3.6
 
 
 def doubts_about_the_carm(
@@ -73,8 +74,9 @@ def doubts_about_the_carm(
         )
     if not doubts and not poses.changes:
         shift, sureness = _common_shift(covariance.intrinsics)
-        far = uncertainty.principal_point_mm * float(shift.abs().max()) > _MOST_COMMON_SHIFT_MM
-        if far and sureness > _SURE_OF_COMMON_SHIFT:
+        far = float(shift.abs().max())
+        is_far = far > _MOST_COMMON_SHIFT and far * uncertainty.principal_point_mm > _MOST_COMMON_SHIFT_MM
+        if is_far and sureness > _SURE_OF_COMMON_SHIFT:
             x, y = shift_px(scene.carm, displays[0], shift)
             doubts.append(
                 f"the images of all views fit principal points some ({x:.0f}, {y:.0f}) pixels from where the C-arm's "
