@@ -54,7 +54,7 @@ docs: .venv/.docs
 
 # every block of code on the pages, all notebooks at reduced size, the site, and a user's typed script (minutes)
 docs-test: .venv/.docs
-	$(BIN)/python -m pytest -m long tests/docs tests/notebooks
+	$(BIN)/python -m pytest -m long tests/docs tests/notebooks tests/test_examples.py
 
 # a wheel in dist/; without what an older build left, which would be packed as well
 wheel: setup

@@ -25,6 +25,7 @@ def test_stages_similarity_and_optimiser_of_ones_own(name: str, monkeypatch: pyt
     assert mm < 1.0
 
 
+@pytest.mark.long  # `make docs-test`
 def test_pelvis_and_both_femora_in_a_fixed_biplane(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     errors = example("biplane", monkeypatch).main(tmp_path)
     assert set(errors) == {"pelvis", "femur_left", "femur_right"}

@@ -33,7 +33,7 @@ def progress_report(console: Console, first: str) -> Iterator[Callable[[str, flo
             progress.update(task, completed=share, description=step)
             if unseen and time.monotonic() - told > _BETWEEN_LINES_S:
                 told = time.monotonic()
-                console.print(f"{share:.0%}: {step}", markup=False, highlight=False, soft_wrap=True)
+                console.print(f"{100 * share:.0f} %: {step}", markup=False, highlight=False, soft_wrap=True)
 
         yield report
 

@@ -206,7 +206,7 @@ def _told_of_carm(carm: CArm) -> list[str]:
     if off > _MOST_OFF_MIDDLE:
         told.append(
             f"the C-arm's file tells a principal point at column {column:.5g} and row {row:.5g} of {camera.shape[1]} × "
-            f"{camera.shape[0]}, {off:.0%} of the picture off its middle: is `principal_point_px` in pixels, the "
+            f"{camera.shape[0]}, {100 * off:.0f} % of the picture off its middle: is `principal_point_px` in pixels, "
             "column first? It is right of a picture that is cropped to one side"
         )
     depth = carm.isocentre_mm[2]

@@ -183,7 +183,9 @@ def _in_short(entry: Path) -> str:
         found = inspect_path(entry)
     except InputError as error:
         return f"{entry.name}: {str(error).removeprefix(f'{entry}: ').rstrip('.')}"
-    return f"{entry.name}: {found.kind}, {found.facts[0].rstrip(':')}"
+    count = len(found.warnings)
+    warned = f"; {count} warning{'s' * (count > 1)}, which `femoreg inspect` of it by itself tells" if count else ""
+    return f"{entry.name}: {found.kind}, {found.facts[0].rstrip(':')}{warned}"
 
 
 def _dicom_file(path: Path) -> Findings:

@@ -112,8 +112,8 @@ def hardly_shown(scene: Scene, poses: Poses, names: Sequence[str]) -> tuple[str,
             )
         elif share < _LEAST_SHOWN:
             found.append(
-                f"{name}: where it is meant to stand, {share:.0%} of it lies in the picture of view 1. If the images "
-                "show no more, its turn about a round guide stays open: take views that show more of it"
+                f"{name}: where it is meant to stand, {100 * share:.0f} % of it lies in the picture of view 1. If the "
+                "images show no more, its turn about a round guide stays open: take views that show more of it"
             )
     return tuple(found)
 

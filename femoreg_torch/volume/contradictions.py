@@ -87,8 +87,8 @@ class Densities:
         if not (self.most < _LEAST_CUT_OFF_HU and self.at_most > _MOST_CUT_OFF and self.least > _AIR_HU):
             return None
         return (
-            f"CT: no bone has more than {self.most:.0f} HU, and {self.at_most:.0%} of their voxels have just that. "
-            "It seems to be saved with a window of a display, so that cortex is lost: export it in HU"
+            f"CT: no bone has more than {self.most:.0f} HU, and {100 * self.at_most:.0f} % of their voxels have just "
+            "that. It seems to be saved with a window of a display, so that cortex is lost: export it in HU"
         )
 
     @property
@@ -189,8 +189,8 @@ def intercept_twice(ct: Volume) -> str | None:
     if dark < _MOST_SO_DARK or soft > _LEAST_SOFT:
         return None
     return (
-        f"{dark:.0%} of the CT has less than {_DARKER_THAN_AIR_HU:g} HU, and air has −1000; {soft:.0%} is as dense as "
-        "soft tissue: is the intercept of the scanner's rescale applied twice?"
+        f"{100 * dark:.0f} % of the CT has less than {_DARKER_THAN_AIR_HU:g} HU, and air has −1000; {100 * soft:.0f} % "
+        "is as dense as soft tissue: is the intercept of the scanner's rescale applied twice?"
     )
 
 

@@ -191,7 +191,7 @@ def read_labels_told(path: Path, like: Volume, ids: Collection[int] | None = Non
     spacing = " × ".join(f"{s:.3g}" for s in labels.spacing_mm)
     note = f"the label map {path.name} has a grid of its own ({spacing} mm): it was resampled by nearest neighbour"
     if kept < _LEAST_INSIDE * labelled:
-        note += f", and {1 - kept / labelled:.0%} of what it labels lies outside the CT"
+        note += f", and {100 * (1 - kept / labelled):.0f} % of what it labels lies outside the CT"
     return LabelsTold(moved, (*told, note), against)
 
 

@@ -15,4 +15,4 @@ def test_a_log_is_told_every_half_minute(monkeypatch: pytest.MonkeyPatch) -> Non
     with telling.progress_report(Console(file=log), "draws") as report:
         for draw in range(1, 5):
             report(f"draw {draw} of 4", draw / 4)
-    assert log.getvalue() == "50%: draw 2 of 4\n100%: draw 4 of 4\n"
+    assert log.getvalue() == "50 %: draw 2 of 4\n100 %: draw 4 of 4\n"

@@ -161,6 +161,7 @@ def test_runs_in_time_and_headers_without_a_space(tmp_path: Path) -> None:
     content = ROWS_FIRST.astype("<i2").tobytes()
     (tmp_path / "bare.nrrd").write_bytes((bare + axes + "\n").encode() + content)
     assert any("names no `space`" in one for one in inspect_path(tmp_path / "bare.nrrd").warnings)
+    assert any(one.startswith("bare.nrrd: CT, ") and " warning" in one for one in inspect_path(tmp_path).facts)
     said = axes.replace("space dimension: 3", "space: left-posterior-superior")
     (tmp_path / "said.nrrd").write_bytes((bare + said + "\n").encode() + content)
     assert not any("space" in one for one in inspect_path(tmp_path / "said.nrrd").warnings)

@@ -11,7 +11,7 @@ from femoreg_torch.volume import Volume
 
 
 @pytest.mark.parametrize(
-    ("aside_mm", "shown"), [(0.0, None), (40.0, None), (61.8, "20% of it"), (400.0, "nothing of it")]
+    ("aside_mm", "shown"), [(0.0, None), (40.0, None), (61.8, "20 % of it"), (400.0, "nothing of it")]
 )
 def test_a_device_beside_the_picture_is_told(aside_mm: float, shown: str | None) -> None:
     """A bar of 40 mm at half the source distance, where the picture is 99 mm wide: 8 of its 40 columns."""

@@ -10,8 +10,15 @@ from nbformat import NotebookNode
 
 from notebooks.execute import FOLDER, execute
 
-USUAL = ("synthetic_fluoroscopy", "one_case_step_by_step")  # the others: `make docs-test`
-APART = ("a_study", "projector_and_conventions", "own_data", "own_parts", "what_an_error_costs")
+USUAL = ("one_case_step_by_step",)  # the others: `make docs-test`
+APART = (
+    "synthetic_fluoroscopy",
+    "a_study",
+    "projector_and_conventions",
+    "own_data",
+    "own_parts",
+    "what_an_error_costs",
+)
 NOTEBOOKS = (*USUAL, *APART)
 # Of a machine's file system: the beginning of a line, a blank, a bracket or a quotation mark stands before it.
 ABSOLUTE_PATH = re.compile(

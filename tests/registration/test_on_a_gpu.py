@@ -227,7 +227,7 @@ def test_what_is_looked_at_twice_is_as_on_the_cpu(scene: Scene, gpu: PretendedGp
     assert also_bent == pytest.approx(bends, rel=0.05, abs=0.02)
     nowhere = torch.ones(6, dtype=torch.float64)
     drift = MotionBetween("device", (1,), ("device",), nowhere, nowhere, 1.0)
-    alone = [gain_alone(s, off_by_a_little(TRUTH), drift, PLAIN).cost for s in (here, there)]
+    alone = [gain_alone(s, off_by_a_little(TRUTH), drift, PLAIN) for s in (here, there)]
     assert alone[0] > 0.01
     assert alone[1] == pytest.approx(alone[0], rel=0.01)
 

@@ -27,7 +27,7 @@ def doubts_about_bends(case: Case, scene: Scene, poses: Poses, imaging: Imaging)
     if not found:
         return ()
     best = max(found, key=lambda bend: bend.gain)
-    return (f"{_told(best)} (straightened so, they fit {best.gain:.0%} better): {_ADVICE[best.way.name]}",)
+    return (f"{_told(best)} (straightened so, they fit {100 * best.gain:.0f} % better): {_ADVICE[best.way.name]}",)
 
 
 _ADVICE = {

@@ -54,8 +54,8 @@ def doubts_about_smears(scene: Scene, poses: Poses) -> tuple[str, ...]:
     """Images that something smeared while they were taken, in words."""
     return tuple(
         f"of view {found.view + 1}, the {scene.first_kind} and the {found.kind} image differ in sharpness along one "
-        f"direction (edges {1 - found.kept:.0%} weaker): one of the two is smeared; hold everything still and take it "
-        "again"
+        f"direction (edges {100 * (1 - found.kept):.0f} % weaker): one of the two is smeared; hold everything "
+        "still and take it again"
         for found in smears(scene, poses)
         if found.kept < _LEAST_KEPT
     )

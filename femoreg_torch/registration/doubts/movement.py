@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 from femoreg_torch.case.quality import largest
 from femoreg_torch.registration.evidence.covariance import PoseCovariance
-from femoreg_torch.registration.evidence.fitted_alone import Gain
 from femoreg_torch.registration.evidence.motion import GuideDrift, JointTurn, MotionBetween
 from femoreg_torch.registration.quality import Limits
 
@@ -16,11 +15,11 @@ from femoreg_torch.registration.quality import Limits
 _GAIN_OF_MOTION = 0.001
 _MOST_MOTION_MM, _MOST_MOTION_DEG, _SURE_OF_MOTION, _SURE_IN_ALL = 0.3, 0.3, 3.0, 2.2
 # Of a device in one view, beside the others, that would gain so much by a step of Newton: what fitting it there by
-# itself gains. Where it moved by 1.2 mm and 0.8° between the views, in six of six at least a share of 0.012; where its
-# handle sagged by 3° in one view of another simulator, 0.007, by 0.0024. Of 16 right ones of three simulators at most
-# 0.002, by 0.0005, though the step of one had promised 0.0020 there.
+# itself saves of the image's cost. Where it moved by 1.2 mm and 0.8° between the views, in six of six at least 0.012;
+# where its handle sagged by 3° in one view of another simulator, 0.007. Of 16 right ones of three simulators at most
+# 0.002, though the step of one had promised as much as of a moved device; of a right one before saturated air 0.003.
 _WORTH_FITTING = 0.0009
-_SHARE_OF_DRIFT, _GAIN_OF_DRIFT = 0.005, 0.001
+_SHARE_OF_DRIFT = 0.005
 # Of a tool along and about its guide in one view alone. Of 39 right ones of three simulators slides were at most 0.3 mm
 # and gained 0.00015; turns at most 0.8°, and 2.5° where they gained less than 0.00005. Slides of 1 and 1.5 mm were
 # measured as 0.7 to 1.4 mm, by 5 deviations and more, and gained 0.0016; turns of 4 to 8° as 2.5 to 5°, by 1.5 to 2.9
@@ -45,7 +44,7 @@ _GAIN_OF_NO_CARM = 0.006
 
 
 def doubts_about_motion(
-    covariance: PoseCovariance, limits: Limits, alone: Callable[[MotionBetween], Gain], *, given: bool = False
+    covariance: PoseCovariance, limits: Limits, alone: Callable[[MotionBetween], float], *, given: bool = False
 ) -> tuple[str, ...]:
     """Anatomy that lies elsewhere in images of another kind, or a device that moved between the views, in words.
 
@@ -131,13 +130,12 @@ def _has_moved(found: MotionBetween) -> bool:
     return far and found.sureness > sure and found.gain > _GAIN_OF_MOTION
 
 
-def _has_drifted(found: MotionBetween, alone: Callable[[MotionBetween], Gain]) -> bool:
+def _has_drifted(found: MotionBetween, alone: Callable[[MotionBetween], float]) -> bool:
     if found.kind is None:
         return found.gain > _GAIN_OF_BONE_DRIFT
     if found.gain <= _WORTH_FITTING:
         return False
-    gain = alone(found)
-    return gain.share > _SHARE_OF_DRIFT or gain.cost > _GAIN_OF_DRIFT
+    return alone(found) > _SHARE_OF_DRIFT
 
 
 def _has_turned(found: JointTurn) -> bool:

@@ -60,7 +60,7 @@ def costs_of_bones(scene: Scene, poses: Poses, names: Sequence[str], imaging: Im
 
 @dataclass(frozen=True, eq=False)
 class Refitted:
-    """Bones that were fitted again: what their images cost, and what they say of the amounts that were asked for."""
+    """What was fitted again: what its images cost, and what they say of the amounts that were asked for."""
 
     cost: float
     asked: Profile

@@ -5,7 +5,6 @@ the image hardly bends the cost, it says too much. Fitted, the device tells what
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 
@@ -25,16 +24,8 @@ _FIT = LevenbergMarquardt(max_iterations=12)
 _SCALE = (math.pi / 180,) * 3 + (1.0,) * 3  # rad and mm: one unit of a motion
 
 
-@dataclass(frozen=True)
-class Gain:
-    """What fitting by itself gains."""
-
-    cost: float  # by so much the image costs less
-    share: float  # of what it cost before
-
-
-def gain_alone(scene: Scene, poses: Poses, drift: MotionBetween, imaging: Imaging) -> Gain:
-    """What is gained where the objects of a drift are fitted in its image of one kind and view, by themselves."""
+def gain_alone(scene: Scene, poses: Poses, drift: MotionBetween, imaging: Imaging) -> float:
+    """Share of the cost of a drift's image, of one kind and view, that fitting its objects there alone saves."""
     assert drift.kind is not None
     name, view = drift.objects[0], drift.views[0]
     scale = torch.tensor(_SCALE, dtype=torch.float64)
@@ -43,4 +34,4 @@ def gain_alone(scene: Scene, poses: Poses, drift: MotionBetween, imaging: Imagin
     costs = image_costs(scene, poses, (body,), list(poses.camera1_from), images, _LEVEL, _SIMILARITY, imaging=imaging)
     before = float(costs(costs.still[None]).mean())
     found = _FIT.minimise(stage_objective(costs, costs.bodies, None), len(costs.still), 0)
-    return Gain(before - found.value, (before - found.value) / before)
+    return (before - found.value) / before

@@ -14,11 +14,12 @@ from torch import Tensor
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
-from femoreg_torch.optimize import LevenbergMarquardt, parabola_minimum
-from femoreg_torch.registration.costs import image_costs
+from femoreg_torch.optimize import LevenbergMarquardt, Result, parabola_minimum, profile
+from femoreg_torch.registration.costs import ImageCosts, image_costs
+from femoreg_torch.registration.evidence.bones import Amount, Refitted
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import stage_objective
+from femoreg_torch.registration.objective import mean_quadratic, stage_objective
 from femoreg_torch.registration.scene import Body, Kind, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume
@@ -37,12 +38,15 @@ class Size:
 
     factor: float  # by its model
     gain: float  # of mean patch Grad-NCC, by the best size that was tried
+    step: Amount  # by which a step of Newton would enlarge the model, 0.01 for 1 %; 0 where no size gains
 
 
 def device_size(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imaging) -> Size | None:
     """How large the images of a kind show a device, its pose fitted to each size; all else stays where it is.
 
-    None where an image leaves nothing to compare, as where all of it is saturated.
+    Where a thin needle or saturated air leaves the size open, a parabola through the sizes says anything. So the step
+    of Newton says how sure that is, the darkness of the device being refitted, by the sandwich estimator over tiles
+    (`registration.evidence.covariance`). None where an image leaves nothing to compare, as where it is all saturated.
     """
     images = scene.there([kind], range(scene.views))
     thing = scene.objects[name]
@@ -54,15 +58,28 @@ def device_size(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imag
         return None
     drawn = costs.objects[name]
 
-    def fitted(factor: float) -> float:
+    def fitted(factor: float) -> Result:
         scaled = replace(drawn, volume=_scaled(drawn.volume, factor, thing.reference_point))
         objective = stage_objective(costs.with_object(name, scaled), (body,), None)
-        return _OPTIMISER.minimise(objective, len(costs.still), seed=0).value
+        return _OPTIMISER.minimise(objective, len(costs.still), seed=0)
 
-    less, equal, more = on_all_cores(fitted, [1 - _STEP, 1.0, 1 + _STEP], scene.device)
+    tried = on_all_cores(fitted, [1 - _STEP, 1.0, 1 + _STEP], scene.device)
+    less, equal, more = (found.value for found in tried)
     steps = parabola_minimum(less, equal, more)
     steps = 0.0 if math.isnan(steps) else min(max(steps, -_FURTHEST), _FURTHEST)
-    return Size(1 + _STEP * steps, equal - min(less, equal, more))
+    gain = equal - min(less, equal, more)
+    step = _step(costs, tried[1].delta, name, thing.reference_point) if gain > 0 else Amount(0.0, math.inf)
+    return Size(1 + _STEP * steps, gain, step)
+
+
+def _step(costs: ImageCosts, delta: Tensor, name: str, centre: Tensor) -> Amount:
+    """The step of Newton of an object's size about a point (3,) mm, its pose and its darkness being refitted."""
+    rate = torch.zeros(4, 4, dtype=torch.float64)
+    rate[:3, :3], rate[:3, 3] = torch.eye(3), -centre
+    darkness = [(name, costs.objects[name].volume)]
+    model = mean_quadratic(costs.quadratics(delta, darkness, shapes=[{name: rate}]))
+    asked = Refitted(model.value, profile(model, 1))
+    return Amount(float(asked.left), float(asked.deviations))
 
 
 def _scaled(volume: Volume, factor: float, centre: Tensor) -> Volume:

@@ -81,8 +81,8 @@ def told_of_bare_bone(name: str, head: Tensor, ct: Volume, bones: BoneLabels) ->
     if bare is None:
         return ()
     return (
-        f"about {name} the CT shows {bare[1]:.0f} ml of bone, {bare[0]:.0%} of what is there, that no label covers: is "
-        "a bone missing in the label map, or its id in `ct.bones`? What is not labelled is not drawn",
+        f"about {name} the CT shows {bare[1]:.0f} ml of bone, {100 * bare[0]:.0f} % of what is there, that no label "
+        "covers: is a bone missing in the label map, or its id in `ct.bones`? What is not labelled is not drawn",
     )
 
 

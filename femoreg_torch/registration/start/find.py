@@ -135,7 +135,7 @@ def find_start(
     if fit.overlap < least:
         raise InputError(
             f"{', '.join(outline.bones)} of the CT, drawn where the landmarks put them, and as the network sees them "
-            f"agree by {fit.overlap:.0%} only (Dice; {least:.0%} are asked for). Is it the same "
+            f"agree by {100 * fit.overlap:.0f} % only (Dice; {100 * least:.0f} % are asked for). Is it the same "
             "patient? Otherwise take a view that shows more of them, or give the landmarks by hand (--landmarks)."
         )
     return Start(fit.camera_from_ct, pnp, used, fit.overlap)

@@ -123,7 +123,7 @@ RIM, TWIST, COLUMNS, ROWS = _ways((0, 2))
         ([Bend(COLUMNS, (Amount(0.1, 0.02), Amount(-0.3, 0.02)), 0.028)], None),  # sure, but little
         (
             [Bend(ROWS, (Amount(2.0, 0.2), Amount(0, 0.1)), 0.02), Bend(TWIST, (Amount(4, 1), Amount(3, 1)), 0.05)],
-            "twisted at their rim, by 4.0 mm in view 1 and 3.0 mm in view 3 (straightened so, they fit 5% better)",
+            "twisted at their rim, by 4.0 mm in view 1 and 3.0 mm in view 3 (straightened so, they fit 5 % better)",
         ),
     ],
 )

@@ -151,7 +151,7 @@ def test_another_patient_is_refused(seen: Tensor) -> None:
     with pytest.raises(InputError, match=r"agree by \d+% only .*same patient.*--landmarks"):
         find_start(landmarks, detection(seen, points), image, CAMERA, outline(2.0, 0.7), HIP)
     blind = replace(detection(seen, points), segmentation=torch.zeros_like(seen))
-    with pytest.raises(InputError, match="agree by 0% only"):
+    with pytest.raises(InputError, match="agree by 0 % only"):
         find_start(landmarks, blind, image, CAMERA, outline(2.0), HIP)
 
 
