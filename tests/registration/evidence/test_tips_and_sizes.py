@@ -15,12 +15,14 @@ from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, CArm, centred_camera, project_points, transform_points
 from femoreg_torch.registration.doubts.device import (
     _is_borne_out,
+    _is_off,
     doubts_about_size,
     doubts_about_told_tips,
     doubts_about_units,
     notes_on_unseen_tips,
 )
-from femoreg_torch.registration.evidence.sizes import device_size
+from femoreg_torch.registration.evidence.bones import Amount
+from femoreg_torch.registration.evidence.sizes import Size, device_size
 from femoreg_torch.registration.evidence.tips import TipLength, _near_the_tip, _parted, _stretched, tip_length
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.scene import RigidObject, Scene
@@ -191,9 +193,22 @@ def test_a_model_of_another_size_is_told(scene: Scene, factor: float, words: str
     shown = device_size(wrong, TRUTH, "device", "device", PLAIN)
     assert shown is not None
     assert shown.factor == pytest.approx(1 / factor, abs=0.012)
+    assert shown.step.value == pytest.approx(1 / factor - 1, rel=0.5)
     (doubt,) = doubts_about_size(CASE, wrong, wrong, TRUTH, PLAIN)
     assert words in doubt
     assert "than its model, beside the pelvis" in doubt
+
+
+@pytest.mark.parametrize(
+    ("found", "off"),
+    [
+        (Size(0.96, 0.0005, Amount(-0.004, 0.0016)), False),  # a right needle, whose size nothing tells
+        (Size(1.016, 0.0007, Amount(0.0085, 0.0059)), False),  # a right tube before saturated air
+        (Size(0.984, 0.0006, Amount(-0.011, 0.0048)), True),  # a model told 2 % too large
+    ],
+)
+def test_a_size_is_told_where_the_images_are_sure(found: Size, off: bool) -> None:
+    assert _is_off(found) == off
 
 
 @pytest.mark.parametrize(
