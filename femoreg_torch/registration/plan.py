@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from femoreg_torch.configs import load_preset
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.extensions import find, pop_kind, record_of
 from femoreg_torch.optimize import Optimiser, read_optimiser
 from femoreg_torch.registration.imaging import PLAIN, Imaging
@@ -58,7 +58,7 @@ def plan_from(name: str, content: dict[str, Any]) -> Plan:
     steps = read_record(_Content, content, where).steps
     if not steps:
         raise InputError(f"{where}, steps: none is left, so nothing would be registered. Name at least one.")
-    return Plan(name, tuple(_step(step, f"{where}, step {i + 1}") for i, step in enumerate(steps)))
+    return Plan(name, tuple(_step(step, f"{where}, {_called(i, step)}") for i, step in enumerate(steps)))
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,12 @@ class _Content:
     """What a preset holds."""
 
     steps: list[dict[str, Any]]
+
+
+def _called(index: int, content: dict[str, Any]) -> str:
+    """The number of a step, from 1, and its name, if it has one."""
+    name = content.get("name")
+    return f"step {index + 1}{f' ({shortened(name)})' if isinstance(name, str) else ''}"
 
 
 def _step(content: dict[str, Any], where: str) -> Step:

@@ -139,16 +139,16 @@ def test_a_file_may_change_a_preset(tmp_path: Path) -> None:
     [
         ({"images": "second"}, "step 1.*images"),
         ({"colour": "red"}, "step 1.*colour"),
-        ({"kind": "stag"}, "step 1: unknown kind 'stag'. Known kinds: stage, orbit_search"),
-        ({"kind": None}, "step 1: a mapping with the key `kind`"),
+        ({"kind": "stag"}, "step 1 \\('a'\\): unknown kind 'stag'. Known kinds: stage, orbit_search"),
+        ({"kind": None}, "step 1 \\('a'\\): a mapping with the key `kind`"),
         ({"weights": ["bone"]}, "step 1.*weights"),
         ({"bodies": [{**STAGE["bodies"][0], "rotation_deg": [1, 1]}]}, "step 1.*need three numbers"),  # type: ignore[index,dict-item]
         ({"bodies": [{**STAGE["bodies"][0], "move": ["views"]}]}, "step 1.*needs `images: all`"),  # type: ignore[index,dict-item]
-        ({"level": {"pixel_mm": 0, "step_mm": 1}}, "step 1: pixel_mm: 0.01 to 100"),
-        ({"similarity": {"kind": "mi"}}, "step 1, similarity: unknown kind 'mi'. Known kinds: grad_ncc, ncc"),
-        ({"similarity": {"kind": "ncc", "radius": 3}}, "step 1, similarity, ncc: unknown key 'radius'"),
-        ({"optimiser": {"population": 3}}, "step 1, optimiser: a mapping with the key `kind`"),
-        ({"optimiser": {"kind": "cma_es", "population": "many"}}, "step 1, optimiser, cma_es: .*population"),
+        ({"level": {"pixel_mm": 0, "step_mm": 1}}, "step 1 \\('a'\\): pixel_mm: 0.01 to 100"),
+        ({"similarity": {"kind": "mi"}}, "step 1 \\('a'\\), similarity: unknown kind 'mi'. Known kinds: grad_ncc, ncc"),
+        ({"similarity": {"kind": "ncc", "radius": 3}}, "step 1 \\('a'\\), similarity, ncc: unknown key 'radius'"),
+        ({"optimiser": {"population": 3}}, "step 1 \\('a'\\), optimiser: a mapping with the key `kind`"),
+        ({"optimiser": {"kind": "cma_es", "population": "many"}}, "step 1 \\('a'\\), optimiser, cma_es: .*population"),
     ],
 )
 def test_a_mistake_is_told_with_preset_and_step(change: dict[str, object], says: str, tmp_path: Path) -> None:
@@ -159,7 +159,7 @@ def test_a_mistake_is_told_with_preset_and_step(change: dict[str, object], says:
 
 @pytest.mark.parametrize("key", ["similarity", "optimiser", "level"])
 def test_a_missing_key_is_named(key: str) -> None:
-    with pytest.raises(InputError, match=f"preset mine, step 1: .*{key}"):
+    with pytest.raises(InputError, match=f"preset mine, step 1 \\('a'\\): .*{key}"):
         plan_from("mine", {"steps": [{name: value for name, value in STAGE.items() if name != key}]})
 
 
