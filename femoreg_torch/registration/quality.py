@@ -40,6 +40,7 @@ _LEVEL = Level(pixel_mm=1.55, step_mm=0.5)
 _SIMILARITY = GradNcc(patch_radius=5)
 _PROBE_MM = 0.6  # about half a pixel of the level, at the object
 _NO_PEAK_MM = 50.0  # a step so far is that of a slope without a peak nearby
+_LOWER = 5e-5  # of a similarity: less is none, as it is told
 
 
 @dataclass(frozen=True)
@@ -238,9 +239,10 @@ def _unturned(name: str, lost: tuple[float, float] | None, limits: Limits) -> st
         return None
     for loss, axis in zip(lost, ("long axis", "guide"), strict=True):
         if not loss >= limits.least_loss_by_turning:
+            nearly = f"nearly as well (similarity {loss:.4f} lower)" if loss >= _LOWER else "as well"
             return (
                 f"no image tells the turn of the {name} about its {axis}: turned by 20 or 180°, what the images show "
-                f"of it fits nearly as well (similarity {loss:.4f} lower); let them show more of it"
+                f"of it fits {nearly}; let them show more of it"
             )
     return None
 

@@ -152,6 +152,16 @@ def test_a_turn_that_costs_nothing_is_not_told(lost: float, told: bool) -> None:
     assert (_unturned("device", (math.inf, lost / 16), Limits()) is None) is told
 
 
+@pytest.mark.parametrize(
+    ("lost", "words"),
+    [(0.0003, "nearly as well (similarity 0.0003 lower);"), (-2e-5, "as well;"), (math.nan, "as well;")],
+)
+def test_a_turn_that_costs_nothing_is_told_in_words(lost: float, words: str) -> None:
+    told = _unturned("device", (lost, math.inf), Limits())
+    assert told is not None
+    assert f"of it fits {words}" in told
+
+
 def test_a_device_is_turned_about_what_is_in_view(scene: Scene) -> None:
     """A round guide with a handle: turning it costs much, but next to nothing where a shutter hides the handle."""
     z, y, x = torch.meshgrid(*[torch.arange(n).double() for n in (120, 61, 61)], indexing="ij")
