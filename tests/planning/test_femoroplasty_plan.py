@@ -47,7 +47,7 @@ from femoreg_torch.volume import Volume, read_ct, read_label_map, write_landmark
 
 PRESET = """extends: default
 calibration: {kind: uncalibrated}
-mesh: {size_mm: 6, search_mm: 7}
+mesh: {size_mm: 8, search_mm: 9}
 distribution: {steps: 2}
 path: {evaluations: 360, polish: 1, compared: 1, fine: 1, lowest_entry_mm: 70, clearance_mm: 4}
 diffusion: {voxel_mm: 3}
@@ -109,7 +109,7 @@ def test_no_cement_no_gain_and_cement_gains(prepared: Prepared, plan: Femoroplas
 def test_loads_are_told_by_finer_elements_than_those_of_the_first_search(
     prepared: Prepared, plan: FemoroplastyPlan
 ) -> None:
-    coarse = prepared.on_elements(7.0)
+    coarse = prepared.on_elements(9.0)
     assert len(prepared.model.mesh.elements) > len(coarse.model.mesh.elements)
     assert plan.optimum.baseline.yield_load_n == coarse.curve().yield_load_n != plan.baseline.yield_load_n
     assert plan.optimum_curve.yield_load_n == prepared.curve(plan.optimum.cement).yield_load_n
@@ -272,7 +272,7 @@ def test_files_tell_the_plan(
     assert len(fields.cells[0].data) == len(prepared.model.mesh.elements)
     corners = fields.points[fields.cells[0].data[0]]
     sides = np.linalg.norm(corners - np.roll(corners, -1, 0), axis=1)
-    np.testing.assert_allclose(sides[[0, 1, 2, 4, 5, 6]], 6.0)  # VTK's order: round the bottom, then round the top
+    np.testing.assert_allclose(sides[[0, 1, 2, 4, 5, 6]], 8.0)  # VTK's order: round the bottom, then round the top
     stored = read_plan(written)
     assert stored.planning == prepared.planning
     assert stored.path.length_mm == pytest.approx(plan.path.length_mm)
