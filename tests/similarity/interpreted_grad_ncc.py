@@ -28,10 +28,10 @@ def images(count: int, seed: int) -> Tensor:
 def test_values_and_gradients(similarity: GradNcc, weighted: bool) -> None:
     fixed = images(1, 0)[0]
     against = similarity.against(fixed, images(1, 7)[0] if weighted else None)
-    moving = torch.cat([images(2, 1), fixed[None]]).requires_grad_()
+    moving = torch.cat([images(1, 1), fixed[None]]).requires_grad_()
     expected = against._reference(moving.double())
     (slopes,) = torch.autograd.grad(expected.sum(), moving)
-    assert expected[2] > 0.6
+    assert expected[1] > 0.6
     torch.testing.assert_close(cuda.grad_ncc(moving.detach(), against), expected.detach(), rtol=1e-5, atol=1e-6)
     values, gradient = cuda.grad_ncc_and_gradient(moving.detach(), against)
     torch.testing.assert_close(values, expected.detach(), rtol=1e-5, atol=1e-6)
