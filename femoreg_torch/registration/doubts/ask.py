@@ -24,7 +24,7 @@ from femoreg_torch.registration.evidence.covariance import PoseCovariance
 from femoreg_torch.registration.evidence.fitted_alone import gain_alone
 from femoreg_torch.registration.evidence.misfits import misfits
 from femoreg_torch.registration.imaging import Imaging
-from femoreg_torch.registration.quality import Limits
+from femoreg_torch.registration.quality import Limits, finer_joint_turns
 from femoreg_torch.registration.scene import Scene
 
 
@@ -46,7 +46,11 @@ def doubts(
         lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
         lambda: doubts_about_the_views(scene, poses),
         lambda: doubts_about_motion(
-            covariance, limits, lambda drift: gain_alone(scene, poses, drift, imaging), given=given
+            covariance,
+            limits,
+            lambda drift: gain_alone(scene, poses, drift, imaging),
+            lambda: finer_joint_turns(scene, poses, imaging),
+            given=given,
         ),
     ]
     questions: list[Callable[[], tuple[str, ...]]] = [
