@@ -126,13 +126,32 @@ def landmarks_without_bones(bones: BoneLabels, landmarks: Mapping[str, Tensor], 
 
 
 def merged_bones(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy | None) -> list[str]:
-    """In words, bones that the label map has as part of another one; empty if there are none.
+    """In words, bones that the label map has as part of another one, or under its id; empty if there are none.
 
-    Most of the `landmarks` (3,), LPS mm, of such a bone lie on that one, and none of its own voxels is near.
+    Most of the `landmarks` (3,), LPS mm, of such a bone lie on that one, and none of its own voxels is near. Two of
+    which each lies on the other have exchanged ids.
     """
-    if anatomy is None:
-        return []
-    told = []
+    elsewhere = {} if anatomy is None else _on_others(bones, landmarks, anatomy)
+    exchanged = [pair for pair in elsewhere if pair[::-1] in elsewhere]
+    told = [
+        f"label map: landmarks of the {bone} lie on the {other}, and those of the {other} on the {bone}. Exchange their "
+        "ids in `ct.bones`"
+        for bone, other in exchanged
+        if (other, bone) not in exchanged[: exchanged.index((bone, other))]
+    ]
+    return told + [
+        f"label map: {', '.join(marks)} of the {bone} lie on the {other}: does the label map hold both as one, or "
+        "parts of one under the other's id? Part them"
+        for (bone, other), marks in elsewhere.items()
+        if (bone, other) not in exchanged
+    ]
+
+
+def _on_others(
+    bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy
+) -> dict[tuple[str, str], list[str]]:
+    """Landmarks of bones, by name, most of which lie on the voxels of another one, by the names of both."""
+    found_on: dict[tuple[str, str], list[str]] = {}
     for bone in (bone for bone in anatomy.bones if bone.name in bones.ids or bone.name in bones.absent):
         marked = anatomy.landmarks_of(bone.name)
         given = [mark for mark in marked if mark in landmarks]
@@ -149,11 +168,8 @@ def merged_bones(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: An
         for other, marks in on.items():
             # one alone may be of the symphysis, which has a bone on either side
             if 2 * len(marks) > len(given) and len(marks) >= min(2, len(marked)):
-                told.append(
-                    f"label map: {', '.join(marks)} of the {bone.name} lie on the {other}: does the label map hold "
-                    "both as one, or parts of one under the other's id? Part them"
-                )
-    return told
+                found_on[bone.name, other] = marks
+    return found_on
 
 
 def _crossed(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: Anatomy, other: Sequence[str]) -> list[str]:

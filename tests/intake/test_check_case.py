@@ -69,6 +69,10 @@ def flipped(c: Content, folder: Path) -> None:
     )
 
 
+def ids_of_femoreg() -> dict[str, int]:
+    return {bone: ids[0] for bone, ids in label_table("femoreg").items()}
+
+
 def relabelled(c: Content, folder: Path, old: int, new: int) -> None:
     image = nibabel.load(folder / "labels.nii.gz")
     values = np.asarray(image.dataobj).copy()
@@ -144,6 +148,11 @@ FAULTS: dict[str, Fault] = {
     "merged": (
         lambda c, f: relabelled(c, f, 1, 5),
         r"label map: .*ASIS-l of the hip_left lie on the femur_left: does the label map hold both as one",
+    ),
+    "exchanged ids": (
+        lambda c, f: c["ct"].update(bones=ids_of_femoreg() | {"hip_left": 5, "femur_left": 1}),
+        r"label map: landmarks of the hip_left lie on the femur_left, and those of the femur_left on the hip_left\. "
+        r"Exchange their ids",
     ),
     "head in hip": (
         lambda c, f: relabelled_ball(f, 5, 1),
