@@ -134,8 +134,8 @@ def merged_bones(bones: BoneLabels, landmarks: Mapping[str, Tensor], anatomy: An
     elsewhere = {} if anatomy is None else _on_others(bones, landmarks, anatomy)
     exchanged = [pair for pair in elsewhere if pair[::-1] in elsewhere]
     told = [
-        f"label map: landmarks of the {bone} lie on the {other}, and those of the {other} on the {bone}. Exchange their "
-        "ids in `ct.bones`"
+        f"label map: landmarks of the {bone} lie on the {other}, and those of the {other} on the {bone}. Exchange "
+        "their ids in `ct.bones`"
         for bone, other in exchanged
         if (other, bone) not in exchanged[: exchanged.index((bone, other))]
     ]
