@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from registration_scenes import CARM, REFERENCE_POINTS, float64, make_scene, off, true_poses
+from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
@@ -14,6 +15,8 @@ from femoreg_torch.optimize import LevenbergMarquardt, Quadratic
 from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.doubts.carm import _common_shift, doubts_about_the_carm
 from femoreg_torch.registration.evidence.covariance import IntrinsicsEstimate, pose_covariance
+from femoreg_torch.registration.evidence.shifted_points import gain_of_shifted_points
+from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, doubted, doubts
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import image_quadratic, stage_objective
@@ -28,6 +31,13 @@ _SIMILARITY = GradNcc(patch_radius=5)
 _SCALE = float64(0.02, 0.02, 0.02, 1.0, 1.0, 4.0)
 AS_SEEN = (Display(),) * 3
 _ALL = tuple(REFERENCE_POINTS)
+
+
+def _saves(shift: Tensor) -> float:
+    """A shift of all principal points that explains the images."""
+    return 1.0
+
+
 _MOVES = ([1.0, 1, 1], [1.0, 1, 4])
 
 
@@ -277,13 +287,16 @@ def test_a_file_far_from_what_the_images_fit_is_told(scene: Scene) -> None:
     wrong = _wrong(scene, 1.10)
     poses = true_poses().with_changes((CameraChange(1 / 1.10),) * 3)
     covariance = final_covariance(wrong, poses)
-    (told,) = doubts_about_the_carm(wrong, poses, covariance, Limits(), AS_SEEN)
+    (told,) = doubts_about_the_carm(wrong, poses, covariance, Limits(), AS_SEEN, _saves)
     assert "the C-arm's file says 1122 mm" in told
     assert "a source distance of 10" in told
     camera = assess_cameras(wrong, poses, covariance, AS_SEEN)[0]
     assert camera.sdd_mm == pytest.approx(1020)
     assert 0 < camera.sdd_deviation_mm < 0.02 * 1020
-    assert doubts_about_the_carm(scene, true_poses(), final_covariance(scene, true_poses()), Limits(), AS_SEEN) == ()
+    assert (
+        doubts_about_the_carm(scene, true_poses(), final_covariance(scene, true_poses()), Limits(), AS_SEEN, _saves)
+        == ()
+    )
 
 
 @pytest.mark.parametrize(("shift_mm", "doubted"), [(0.9, False), (2.4, True)])
@@ -292,38 +305,59 @@ def test_a_principal_point_that_refinement_moved_far_is_told(scene: Scene, shift
     poses = true_poses()
     covariance = final_covariance(scene, poses)
     still, shifted = CameraChange(), CameraChange(principal_point_shift_mm=(0.3, -shift_mm))
-    told = doubts_about_the_carm(scene, poses.with_changes((still, shifted, still)), covariance, Limits(), AS_SEEN)
+    told = doubts_about_the_carm(
+        scene, poses.with_changes((still, shifted, still)), covariance, Limits(), AS_SEEN, _saves
+    )
     assert len(told) == doubted
     assert all("principal point of view 2 by 2.4 mm" in sentence for sentence in told)
 
 
 @pytest.mark.parametrize(
-    ("x_of_views", "deviation", "doubted"),
+    ("x_of_views", "deviation", "gain", "doubted"),
     [
-        ((-2.3, -1.7, -2.0), 0.77, True),  # 12 mm off in all views, of which the images see a part
-        ((-2.3, 1.7, -2.0), 0.77, False),  # each view asks for something else
-        ((-0.2, -1.0, -0.4), 0.8, False),  # a right file
-        ((-1.0, -1.0, -1.0), 0.1, False),  # sure, but no more than the file's own deviation
+        ((-2.3, -1.7, -2.0), 0.77, 0.0016, True),  # 12 mm off in all views, of which the images see a part
+        ((-2.3, -1.7, -2.0), 0.77, math.nan, True),  # and leave nothing to try it on
+        ((-2.3, -1.7, -2.0), 0.77, 0.0003, False),  # a right file: the shift explains nothing
+        ((-2.3, 1.7, -2.0), 0.77, 0.0016, False),  # each view asks for something else
+        ((-0.2, -1.0, -0.4), 0.8, 0.0016, False),  # a right file
+        ((-1.0, -1.0, -1.0), 0.1, 0.0016, False),  # sure, but no more than the file's own deviation
     ],
 )
 def test_a_shift_of_all_principal_points_alike_is_told(
-    scene: Scene, x_of_views: tuple[float, ...], deviation: float, doubted: bool
+    scene: Scene, x_of_views: tuple[float, ...], deviation: float, gain: float, doubted: bool
 ) -> None:
     poses = true_poses()
     covariance = final_covariance(scene, poses)
     mean = torch.zeros_like(covariance.intrinsics.mean)
     mean[1::2] = torch.tensor(x_of_views)
     found = replace(covariance, intrinsics=IntrinsicsEstimate(mean, torch.full_like(mean, deviation)))
-    told = doubts_about_the_carm(scene, poses, found, Limits(), AS_SEEN)
+    told = doubts_about_the_carm(scene, poses, found, Limits(), AS_SEEN, lambda shift: gain)
     assert len(told) == doubted
     assert all("the images of all views fit principal points some (-3, 0) pixels" in sentence for sentence in told)
+
+
+def test_a_shift_that_is_tried_saves_most_where_it_is_right(scene: Scene) -> None:
+    """Of images whose principal points were told 40 mm off; poses make up for most of that."""
+    wrong = _wrong(scene, 1.0, (40.0, 0.0))
+    free = intrinsics_of(wrong, true_poses(), ("pelvis", "femur"))
+    off = float64(0, *(40.0, 0.0) * 3) / free.scale
+    poses = true_poses().slid(free.slides(off[None])[0], ("pelvis", "femur"))
+    shift = float64(-40.0 / scene.carm.assumed_uncertainty.principal_point_mm, 0)
+    gains = [gain_of_shifted_points(wrong, poses, k * shift, PLAIN) for k in (0, 0.5, 1, -1)]
+    assert gains[0] == pytest.approx(0, abs=1e-7)
+    assert gains[2] > gains[1] > 0.0005
+    assert gains[3] < 0
+    dark = replace(wrong, saturated={"anatomy": tuple(torch.ones(88, 88, dtype=torch.bool) for _ in range(3))})
+    assert math.isnan(gain_of_shifted_points(dark.where_unsaturated(), poses, shift, PLAIN))
 
 
 def test_a_file_that_says_how_uncertain_it_is_is_not_doubted_within_that(scene: Scene) -> None:
     """The images ask for 10 mm, and the file is uncertain by 2 or by 10 mm; and a file that is sure."""
     covariance = final_covariance(scene, true_poses())
     sure = replace(scene, carm=replace(scene.carm, uncertainty=Uncertainty(0.0, 0.0)))
-    assert doubts_about_the_carm(sure, true_poses(), final_covariance(sure, true_poses()), Limits(), AS_SEEN) == ()
+    assert (
+        doubts_about_the_carm(sure, true_poses(), final_covariance(sure, true_poses()), Limits(), AS_SEEN, _saves) == ()
+    )
     for principal_point_mm, sentences in ((2.0, 1), (10.0, 0)):
         own = replace(scene.carm.assumed_uncertainty, principal_point_mm=principal_point_mm)
         asked, deviation = 10.0 / principal_point_mm, 2.0 / principal_point_mm  # of each view, without the file
@@ -332,7 +366,9 @@ def test_a_file_that_says_how_uncertain_it_is_is_not_doubted_within_that(scene: 
         mean[1::2] = asked * precision / (1 + precision)
         found = IntrinsicsEstimate(mean, torch.full_like(mean, (1 + precision) ** -0.5))
         uncertain = replace(scene, carm=replace(scene.carm, uncertainty=own))
-        told = doubts_about_the_carm(uncertain, true_poses(), replace(covariance, intrinsics=found), Limits(), AS_SEEN)
+        told = doubts_about_the_carm(
+            uncertain, true_poses(), replace(covariance, intrinsics=found), Limits(), AS_SEEN, _saves
+        )
         assert len(told) == sentences
 
 
@@ -352,7 +388,7 @@ def test_a_source_distance_that_refinement_moved_far_is_told(scene: Scene, facto
     """As with the CT of another patient: 11 % off, and images that say nothing of it at the end."""
     poses = true_poses().with_changes((CameraChange(factor),) * 3)
     covariance = final_covariance(scene, true_poses())
-    told = doubts_about_the_carm(scene, poses, covariance, Limits(), AS_SEEN)
+    told = doubts_about_the_carm(scene, poses, covariance, Limits(), AS_SEEN, _saves)
     assert len(told) == doubted
     assert all(f"to {factor * CARM.camera.sdd_mm:.0f} mm" in sentence for sentence in told)
 

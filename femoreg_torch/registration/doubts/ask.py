@@ -23,6 +23,7 @@ from femoreg_torch.registration.doubts.shape import doubts_about_handedness, dou
 from femoreg_torch.registration.evidence.covariance import PoseCovariance
 from femoreg_torch.registration.evidence.fitted_alone import gain_alone
 from femoreg_torch.registration.evidence.misfits import misfits
+from femoreg_torch.registration.evidence.shifted_points import gain_of_shifted_points
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.quality import Limits, finer_joint_turns
 from femoreg_torch.registration.scene import Scene
@@ -43,7 +44,14 @@ def doubts(
     clear = scene.where_unsaturated()
     given = scene.camera_from_camera1 is not None
     geometry: list[Callable[[], tuple[str, ...]]] = [
-        lambda: doubts_about_the_carm(scene, poses, covariance, limits, displays),
+        lambda: doubts_about_the_carm(
+            scene,
+            poses,
+            covariance,
+            limits,
+            displays,
+            lambda shift: gain_of_shifted_points(scene, poses, shift, imaging),
+        ),
         lambda: doubts_about_the_views(scene, poses),
         lambda: doubts_about_motion(
             covariance,
