@@ -45,10 +45,11 @@ from femoreg_torch.registration.evidence.fitted_alone import gain_alone
 from femoreg_torch.registration.evidence.handedness import handedness
 from femoreg_torch.registration.evidence.motion import MotionBetween
 from femoreg_torch.registration.evidence.rigidity import bend, images_of
+from femoreg_torch.registration.evidence.shifted_points import gain_of_shifted_points
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.materials.calibration import Calibration
 from femoreg_torch.registration.objective import stage_objective
-from femoreg_torch.registration.quality import Limits, assess, final_covariance
+from femoreg_torch.registration.quality import Limits, assess, final_covariance, finer_joint_turns
 from femoreg_torch.registration.scene import Body, Moving, Outline, intrinsics_of, reference_point_in_view
 from femoreg_torch.registration.stage import run_stage
 from femoreg_torch.registration.start.silhouette import refine_by_silhouette
@@ -199,7 +200,7 @@ def test_a_plan_ends_where_it_ends_on_the_cpu(scene: Scene, gpu: PretendedGpu | 
 
 
 def test_what_is_looked_at_twice_is_as_on_the_cpu(scene: Scene, gpu: PretendedGpu | None) -> None:
-    """Of bones 2 % too short, of pictures of which one half lies lower, and of a device that seems to have moved."""
+    """Bones 2 % too short, pictures of which one half lies lower, a device and a leg that moved, principal points."""
     squeezed = torch.eye(4, dtype=torch.float64)
     squeezed[2, 2] = 0.98
     objects = dict(scene.objects)
@@ -230,6 +231,13 @@ def test_what_is_looked_at_twice_is_as_on_the_cpu(scene: Scene, gpu: PretendedGp
     alone = [gain_alone(s, off_by_a_little(TRUTH), drift, PLAIN) for s in (here, there)]
     assert alone[0] > 0.01
     assert alone[1] == pytest.approx(alone[0], rel=0.01)
+    shift = torch.tensor([1.5, -1.0], dtype=torch.float64)
+    tried = [gain_of_shifted_points(s, off_by_a_little(TRUTH), shift, PLAIN) for s in (here, there)]
+    assert abs(tried[0]) > 1e-6
+    assert tried[1] == pytest.approx(tried[0], rel=0.01, abs=1e-6)
+    turns, also_turns = (finer_joint_turns(s, TRUTH) for s in (here, there))
+    assert turns
+    assert [turn.degrees for turn in also_turns] == pytest.approx([turn.degrees for turn in turns], rel=0.01, abs=1e-3)
 
 
 def off_by_a_little(poses: Poses) -> Poses:
