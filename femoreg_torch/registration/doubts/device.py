@@ -172,7 +172,7 @@ def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imagi
             )
         if words:
             found.append(
-                f"the images show {', and '.join(words)}: check that the model is the one in the images, its length, "
+                f"the images show {', or '.join(words)}: check that the model is the one in the images, its length, "
                 "size and unit, and the voxel size of the CT"
             )
     return tuple(found)

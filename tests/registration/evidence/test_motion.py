@@ -180,6 +180,7 @@ def test_a_turn_in_a_joint_is_told_that_is_far_and_sure_and_explains_something(
     ("coarse", "finer", "told"),
     [
         (JointTurn(0, "femur", 0.84, 3.1, 0.0003), JointTurn(0, "femur", 0.73, 4.1, 0.0004), 1),  # turned by 0.9°
+        (JointTurn(0, "femur", 0.71, 2.8, 0.0006), JointTurn(0, "femur", 0.74, 3.5, 0.0010), 1),  # bent by 0.9°
         (JointTurn(0, "femur", 0.75, 2.6, 0.0003), JointTurn(0, "femur", 0.63, 2.7, 0.0003), 0),  # a right one
         (JointTurn(0, "femur", 0.50, 3.0, 0.0002), JointTurn(0, "femur", 0.73, 4.1, 0.0004), 0),  # not worth it
     ],
