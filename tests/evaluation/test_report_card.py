@@ -162,15 +162,3 @@ def test_without_a_device_it_says_what_is_missing(case: Case, result: Result) ->
     assert "no tool was registered" in told.without_numbers.lower()
     assert any("take images with it" in step for step in told.next)
     assert told.left_out == ("There are no lateral images.",)
-
-
-def test_what_holds_of_several_images_is_said_once(case: Case, result: Result) -> None:
-    notes = ["there are no lateral images"]
-    notes += [f"view {view}, {kind} image: a round shutter" for kind in ("anatomy", "device") for view in (1, 2, 3)]
-    notes += ["view 2, device image: saturated"]
-    told = card(case, replace(result, skipped=tuple(notes)))
-    assert told.left_out == (
-        "There are no lateral images.",
-        "Views 1, 2, 3, anatomy images; views 1, 2, 3, device images: a round shutter.",
-        "View 2, device image: saturated.",
-    )

@@ -1,8 +1,7 @@
 """The card that a report opens with: can it be trusted, where is the guide, what corrects it, what is to be done."""
 
 import math
-import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -21,7 +20,6 @@ _TRUSTED = (
 )
 _WITHIN_DEVIATIONS = 2.0  # an offset of so many standard deviations is not told apart from none
 _NO_TURN_DEG = 0.005  # told as 0.00°
-_OF_IMAGE = re.compile(r"view (\d+), (.+?) image: (.+)")
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ def card(case: Case, result: Result) -> Card:
     verdict = result.verdict
     headline = "Trusted" if verdict.trusted else "Not trusted"
     reasons = tuple(sentence(reason) for reason in verdict.reasons) or (_TRUSTED,)
-    left_out = tuple(sentence(note) for note in _together(result.skipped))
+    left_out = tuple(sentence(note) for note in result.skipped)
     try:
         found = guide(result)
     except InputError as error:
@@ -69,23 +67,6 @@ def card(case: Case, result: Result) -> Card:
         tuple(_next(result, found, sure)),
         left_out,
     )
-
-
-def _together(notes: Iterable[str]) -> Iterator[str]:
-    """Notes, those that say the same of several images in one."""
-    said: dict[str, dict[str, list[str]]] = {}  # of a kind of images, in these views
-    for note in notes:
-        match = _OF_IMAGE.fullmatch(note)
-        view, kind, words = match.groups() if match else ("", "", note)
-        said.setdefault(words, {}).setdefault(kind, []).append(view)
-    for words, kinds in said.items():
-        places = [_images(kind, views) for kind, views in kinds.items() if kind]
-        yield f"{'; '.join(places)}: {words}" if places else words
-
-
-def _images(kind: str, views: list[str]) -> str:
-    one = len(views) == 1
-    return f"view{'' if one else 's'} {', '.join(views)}, {kind} image{'' if one else 's'}"
 
 
 def _numbers(found: Guidance, sure: GuideUncertainty | None) -> Iterator[Number]:

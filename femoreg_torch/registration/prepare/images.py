@@ -1,7 +1,7 @@
 """The fluoroscopic images of a case: attenuation, exposed fields, saturated pixels, and what is said of them."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,9 +74,27 @@ def read_images(case: Case) -> tuple[ByKind, ByKind, tuple[str, ...]]:
     images = {kind: tuple(None if one is None else one.attenuation for one in read) for kind, read in found.items()}
     fields = {kind: tuple(None if one is None else one.field for one in read) for kind, read in found.items()}
     _check_different(case, images)
-    remarks = [remark for read in found.values() for one in read if one is not None for remark in one.told]
+    remarks = _summed({kind: [() if one is None else one.told for one in read] for kind, read in found.items()})
     exposures = [one.exposure for read in found.values() for one in read if one is not None and one.exposure]
     return images, fields, (*remarks, *told, *_told_by_headers(exposures, case.ct_path))
+
+
+def _summed(remarks: Mapping[Kind, Sequence[tuple[str, ...]]]) -> list[str]:
+    """The remarks on the images of every kind and view, with the images that they are of; each of them once."""
+    of: dict[str, list[tuple[Kind, int]]] = {}
+    for kind, views in remarks.items():
+        for number, told in enumerate(views, 1):
+            for remark in told:
+                of.setdefault(remark, []).append((kind, number))
+    return [f"{_images(images)}: {remark}" for remark, images in of.items()]
+
+
+def _images(images: Sequence[tuple[Kind, int]]) -> str:
+    """Images by kind and view (from 1), in words."""
+    if len(images) == 1:
+        return f"view {images[0][1]}, {images[0][0]} image"
+    by_kind = {kind: [number for each, number in images if each == kind] for kind, _ in images}
+    return ", ".join(f"{kind} image{'s' * (len(of) > 1)} of {_views(of)}" for kind, of in by_kind.items())
 
 
 def _that_may_shade(image: "_Image", shutters: Sequence[Shutter]) -> list[Shutter]:
@@ -160,7 +178,7 @@ def _listed(words: Sequence[object]) -> str:
 class _Image:
     attenuation: Tensor  # (H, W)
     field: Tensor | None  # (H, W) bool: what is exposed; None: all
-    told: tuple[str, ...]  # of a shutter that was found, and of the file, in words
+    told: tuple[str, ...]  # of a shutter that was found, and of the file, in words, without the image's own name
     shutter: Shutter | None  # that was found
     exposure: Exposure | None  # what the header of a DICOM file says
 
@@ -168,7 +186,7 @@ class _Image:
 def _read_image(case: Case, index: int, kind: Kind, shutters: Sequence[Shutter] = ()) -> _Image:
     """One image of a view (from 0) as the source sees it, and its field: see `_field`."""
     view, display, camera = case.views[index], case.display_of(index), case.carm.camera
-    where, told = f"{case.folder}/case.yaml, views[{index}].{kind}", f"view {index + 1}, {kind} image: "
+    where = f"{case.folder}/case.yaml, views[{index}].{kind}"
     stored = read_stored(view.images[kind], view.frames)
     as_stored = display.stored_camera(camera)
     check_matches(stored.values, as_stored, where)
@@ -200,7 +218,7 @@ def _read_image(case: Case, index: int, kind: Kind, shutters: Sequence[Shutter] 
     attenuation = image if logarithms else attenuation_image(image, field)
     name, tags = view.images[kind].name, stored.tags
     exposure = None if tags is None else Exposure(index, kind, name, tags, view.frames)
-    return _Image(attenuation, field, tuple(told + remark for remark in remarks), shutter, exposure)
+    return _Image(attenuation, field, remarks, shutter, exposure)
 
 
 def view_distortion(case: Case, index: int) -> Distortion | None:

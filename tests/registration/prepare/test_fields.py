@@ -173,7 +173,7 @@ def test_a_shutter_that_one_image_hides_is_known_from_another(tmp_path: Path, mo
     assert first is not None
     assert second is not None
     assert torch.equal(first, second)
-    assert len(told) == 2
+    assert told == ("anatomy images of views 1 and 2: a round shutter was found, 58 % of the detector is exposed",)
     write_image(tmp_path / "view2.tif", beam.flip(0).to(torch.uint16))
     found = iter([find_shutter(torch.where(FIELD, beam, 60.0), CARM.camera), None, None])
     assert read_images(case)[1]["anatomy"][1] is None  # its shutter was open
