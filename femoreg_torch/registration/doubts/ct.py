@@ -14,8 +14,8 @@ from femoreg_torch.registration.scene import Scene
 # pixels 1 to 2.5 % too wide or high: stretches of 0.9 to 2.7 % by 4.1 deviations and more; of right CTs one seemed
 # stretched by 2.5 %, by 2.2 deviations. Gantries tilted by 1.5 and 4°, slides of 2 and 4 mm, and two spacings of slices
 # told as one: shears of 1.2 to 6.6 %, by 3 deviations and more, with gains of 0.006 and more; right CTs up to 1.9 % by
-# 5.3 deviations, in views that hardly tell, with gains of 0.002 at most; of 60 more one by 1.6 %, 5 deviations and a gain
-# of 0.0048.
+# 5.3 deviations, in views that hardly tell, with gains of 0.002 at most; of 60 more one by 1.6 %, 5 deviations and a
+# gain of 0.0048.
 # A stretch may gain nothing, as it changes how finely a CT is looked at: down to -0.015; of bones far off, -0.034.
 _MOST_STRETCHED, _SURE_OF_STRETCH, _GAIN_OF_STRETCH = 0.008, 3.5, -0.02
 _MOST_SHEARED, _SURE_OF_SHEAR, _GAIN_OF_SHEAR = 0.012, 2.5, 0.0054
