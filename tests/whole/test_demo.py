@@ -130,25 +130,14 @@ def test_other_label_ids_give_the_same_scene_bit_for_bit(
     assert torch.equal(scene.outline.mask.data, theirs.outline.mask.data)
 
 
-def test_a_result_that_is_not_trusted_ends_in_status_3_if_trust_is_required(demo: Path, tmp_path: Path) -> None:
+def test_a_registration_starts_where_a_file_says_and_ends_in_status_3_if_it_is_to_be_trusted_and_is_not(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A preset of one's own that hardly looks: its result says that it must not be trusted."""
     (tmp_path / "hardly_looks.yaml").write_text(HARDLY_LOOKS, encoding="utf-8")
     arguments = ["register", str(demo / "case"), "--preset", str(tmp_path / "hardly_looks.yaml"), "--out"]
-    assert main([*arguments, str(tmp_path / "run"), "--require-trust"]) == 3
-    result = result_of(tmp_path / "run")
-    assert result["trusted"] is False
-    assert result["reasons"]
-    assert main(["navigate", str(tmp_path / "run")]) == 0
-    assert json.loads((tmp_path / "run" / "navigation.json").read_text(encoding="utf-8"))["trusted"] is False
-
-
-def test_a_registration_starts_where_a_file_says(
-    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "hardly_looks.yaml").write_text(HARDLY_LOOKS, encoding="utf-8")
-    arguments = ["register", str(demo / "case"), "--preset", str(tmp_path / "hardly_looks.yaml"), "--out"]
     start = ["--start", str(demo / "run" / "result.json")]
-    assert main([*arguments, str(tmp_path / "run"), *start]) == 0
+    assert main([*arguments, str(tmp_path / "run"), *start, "--require-trust"]) == 3
     begun, found = (result_of(run) for run in (tmp_path / "run", demo / "run"))
     assert begun["start"]["source"] == "poses that were given"
     torch.testing.assert_close(
@@ -159,6 +148,10 @@ def test_a_registration_starts_where_a_file_says(
     )
     assert any("outlines" in note for note in begun["skipped"])
     assert "outlines" in capsys.readouterr().out
+    assert begun["trusted"] is False
+    assert begun["reasons"]
+    assert main(["navigate", str(tmp_path / "run")]) == 0
+    assert json.loads((tmp_path / "run" / "navigation.json").read_text(encoding="utf-8"))["trusted"] is False
 
 
 def test_a_batch_keeps_what_is_done_and_tells_what_was_refused(

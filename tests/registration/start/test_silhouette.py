@@ -148,7 +148,7 @@ def test_another_patient_is_refused(seen: Tensor) -> None:
     found = find_start(landmarks, detection(seen, points), image, CAMERA, outline(2.0), HIP)
     assert errors(found.camera_from_ct)[0] < 0.5
     assert found.overlap is not None
-    with pytest.raises(InputError, match=r"agree by \d+% only .*same patient.*--landmarks"):
+    with pytest.raises(InputError, match=r"agree by \d+ % only .*same patient.*--landmarks"):
         find_start(landmarks, detection(seen, points), image, CAMERA, outline(2.0, 0.7), HIP)
     blind = replace(detection(seen, points), segmentation=torch.zeros_like(seen))
     with pytest.raises(InputError, match="agree by 0 % only"):
