@@ -210,6 +210,7 @@ def test_a_bone_must_gain_more_than_a_device_to_have_drifted(gain: float, told: 
     [
         (0.0020, 0.002, 0),  # a right one, whose step promised much
         (0.0010, 0.007, 1),  # a handle that sagged
+        (0.0011, 0.022, 1),  # of little cost, and much of that
         (0.0014, 0.003, 0),  # a right one, half before saturated air
         (0.0005, 0.007, 0),  # not worth a fit
     ],

@@ -229,3 +229,14 @@ def test_a_field_is_found_or_told_by_the_case(tmp_path: Path) -> None:
         assert told == ()
     with pytest.raises(InputError, match=r"views\[0\]\.field: exposes no pixel"):
         read_images(case_with(tmp_path, beam, field=Circle((-50, -50), 3)))
+
+
+def test_what_holds_of_several_images_is_said_once() -> None:
+    round_one, bright = "a round shutter", "saturated"
+    told = reading_of_images._summed(
+        {"anatomy": [(round_one,), (round_one,), (round_one,)], "device": [(round_one,), (bright,), ()]}
+    )
+    assert told == [
+        "anatomy images of views 1, 2 and 3, device image of view 1: a round shutter",
+        "view 2, device image: saturated",
+    ]
