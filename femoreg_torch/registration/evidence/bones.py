@@ -14,7 +14,7 @@ from femoreg_torch.registration.costs import ImageCosts, image_costs
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import mean_quadratic, stage_objective
-from femoreg_torch.registration.scene import Body, Scene, reference_point_in_view
+from femoreg_torch.registration.scene import Body, Moving, Scene, reference_point_in_view
 from femoreg_torch.similarity import GradNcc
 
 LEVEL = Level(pixel_mm=3.1, step_mm=2.0)
@@ -37,11 +37,18 @@ class Amount:
         return abs(self.value) / self.deviation if self.deviation > 0 else 0.0
 
 
-def costs_of_bones(scene: Scene, poses: Poses, names: Sequence[str], imaging: Imaging) -> ImageCosts | None:
+def costs_of_bones(
+    scene: Scene,
+    poses: Poses,
+    names: Sequence[str],
+    imaging: Imaging,
+    besides: Sequence[Moving] = (),
+    level: Level = LEVEL,
+) -> ImageCosts | None:
     """The costs of all first images that show the anchor, as functions of how bones and C-arms move.
 
-    `names` are the bones that move, the anchor being one of them. None where fewer than two views show the anchor, or
-    leave nothing to compare.
+    `names` are the bones that move, the anchor being one of them. What moves `besides` them comes last. None where
+    fewer than two views show the anchor, or leave nothing to compare.
     """
     images = scene.first_images(scene.anchor)
     if len(images) < _LEAST_VIEWS:
@@ -51,9 +58,10 @@ def costs_of_bones(scene: Scene, poses: Poses, names: Sequence[str], imaging: Im
     bodies = (
         *(Body((name,), 0, reference_point_in_view(scene, poses, name, 0), scale) for name in names),
         *(Body((), view, reference_point_in_view(scene, poses, scene.anchor, view), scale) for view in carms),
+        *besides,
     )
     try:
-        return image_costs(scene, poses, bodies, list(poses.camera1_from), images, LEVEL, _SIMILARITY, imaging=imaging)
+        return image_costs(scene, poses, bodies, list(poses.camera1_from), images, level, _SIMILARITY, imaging=imaging)
     except InputError:  # what is saturated leaves nothing to compare
         return None
 

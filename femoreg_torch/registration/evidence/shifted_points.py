@@ -10,20 +10,16 @@ import math
 import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
 from femoreg_torch.optimize import profile
-from femoreg_torch.registration.costs import image_costs
+from femoreg_torch.registration.evidence.bones import costs_of_bones
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.intrinsics import POINTS
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.objective import mean_quadratic
-from femoreg_torch.registration.scene import Body, Moving, Scene, intrinsics_of, moved, reference_point_in_view
-from femoreg_torch.similarity import GradNcc
+from femoreg_torch.registration.scene import Scene, intrinsics_of, moved
 
 _LEVEL = Level(pixel_mm=1.55, step_mm=1.0)
-_SIMILARITY = GradNcc(patch_radius=5)
-_SCALE = (math.pi / 180,) * 3 + (1.0,) * 3  # rad and mm: one unit of a motion
 
 
 def gain_of_shifted_points(scene: Scene, poses: Poses, shift: Tensor, imaging: Imaging) -> float:
@@ -33,21 +29,15 @@ def gain_of_shifted_points(scene: Scene, poses: Poses, shift: Tensor, imaging: I
     it. nan where the images leave nothing to compare.
     """
     names = [name for name in poses.camera1_from if scene.first_kind in scene.objects[name].shown_in]
-    images = scene.there([scene.first_kind], range(scene.views))
-    scale = torch.tensor(_SCALE, dtype=torch.float64)
-    carms = range(1, scene.views) if scene.camera_from_camera1 is None else ()
-    bodies: tuple[Moving, ...] = (
-        *(Body((name,), 0, reference_point_in_view(scene, poses, name, 0), scale) for name in names),
-        *(Body((), view, reference_point_in_view(scene, poses, scene.anchor, view), scale) for view in carms),
-        intrinsics_of(scene, poses, names).only({POINTS}),
-    )
-    try:
-        costs = image_costs(scene, poses, bodies, names, images, _LEVEL, _SIMILARITY, imaging=imaging)
-    except InputError:
+    points = intrinsics_of(scene, poses, names).only({POINTS})
+    costs = costs_of_bones(scene, poses, names, imaging, besides=[points], level=_LEVEL)
+    if costs is None:
         return math.nan
     model = mean_quadratic(costs.quadratics(costs.still))
     shifts = shift.repeat(scene.views)
     delta = torch.cat([profile(model, len(shifts)).answer @ shifts, shifts])
-    there = moved(poses, bodies, delta)
-    after = image_costs(scene, there, bodies, names, images, _LEVEL, _SIMILARITY, imaging=imaging)
+    there = moved(poses, costs.bodies, delta)
+    after = costs_of_bones(scene, there, names, imaging, besides=[points], level=_LEVEL)
+    if after is None:
+        return math.nan
     return 1 - float(after(after.still[None]).mean()) / model.value
