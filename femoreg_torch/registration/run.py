@@ -229,7 +229,7 @@ def notes_on_the_views(scene: Scene, poses: Poses) -> tuple[str, ...]:
         if len(views) == 1:
             told.append(
                 f"one view alone shows {name}: how far along the beam it lies is told by its size in the picture, and "
-                "little else"
+                "little else; whether it moved, or is of another size than it was told, was not asked"
             )
     for one, other in itertools.combinations(range(scene.views), 2):
         between = poses.camera_from_camera1[other] @ invert_rigid(poses.camera_from_camera1[one])

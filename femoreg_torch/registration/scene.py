@@ -282,7 +282,8 @@ def shown_by(scene: Scene, poses: Poses, name: str, image: tuple[Kind, int], poi
     """Which points (N, 3) of an object, mm in its space, an image (kind, view) shows in its exposed field: (N,)."""
     kind, view = image
     camera, field = scene.camera(poses, view), scene.field(kind, view)
-    pixels = project_points(camera, transform_points(poses.camera_from(name)[view], points)).round().long()
+    seen_at = project_points(camera, transform_points(poses.camera_from(name)[view], points))
+    pixels = seen_at.nan_to_num(-1).round().long()  # nan: behind the source
     size = torch.tensor(camera.shape[::-1])
     inside = ((pixels >= 0) & (pixels < size)).all(1)
     if field is None:

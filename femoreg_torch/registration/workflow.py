@@ -24,7 +24,7 @@ class Outcome:
     scene: Scene  # with what was estimated of the images
     poses: Poses
     trace: tuple[StageRecord, ...]
-    skipped: tuple[str, ...]  # sentences for people
+    skipped: tuple[str, ...]  # and devices that were not estimated: sentences for people
 
 
 def run_plan(
@@ -46,6 +46,7 @@ def run_plan(
     reasons = {number: _left_out(plan, number, scene, poses) for number in range(len(plan.steps))}
     numbers = [number for number, reason in reasons.items() if reason is None]
     trace: list[StageRecord] = []
+    notes: list[str] = []
     waiting = {name: pose for name, pose in poses.camera1_from.items() if _is_placed_beside(scene, name)}
     for done, number in enumerate(numbers):
         step = plan.steps[number]
@@ -54,7 +55,8 @@ def run_plan(
         if report:
             report(step.name, done / len(numbers))
         if isinstance(step, Calibration):
-            scene, record = step.calibrate(scene, poses)
+            scene, record, left = step.calibrate(scene, poses)
+            notes += left
             records: Iterable[StageRecord] = [record]
         else:
             records = step.run(scene, poses, seed * 1000 + number)
@@ -66,7 +68,7 @@ def run_plan(
     if report:
         report("done", 1.0)
     skipped = (f"stage “{plan.steps[n].name}” was left out: {reason}" for n, reason in reasons.items() if reason)
-    return Outcome(scene, poses, tuple(trace), tuple(skipped))
+    return Outcome(scene, poses, tuple(trace), (*skipped, *notes))
 
 
 def _is_placed_beside(scene: Scene, name: str) -> bool:

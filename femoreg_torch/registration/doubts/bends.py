@@ -42,9 +42,12 @@ _ADVICE = {
 
 def _is_sure(bend: Bend) -> bool:
     gain, sure = (_GAIN_AT_RIM, _SURE_AT_RIM) if bend.way.name == "rim" else (_GAIN, _SURE)
-    sizes = [abs(each.value) for each in bend.amounts]
-    sure_ones = [size for size, each in zip(sizes, bend.amounts, strict=True) if each.sureness > sure]
-    return bend.gain > gain and max(sizes) < _MOST_MM and max(sure_ones, default=0.0) > bend.way.least_mm
+    values = [
+        each.value if bend.way.name == "rim" else abs(each.value) for each in bend.amounts
+    ]  # a barrel is not told
+    sure_ones = [value for value, each in zip(values, bend.amounts, strict=True) if each.sureness > sure]
+    within = max(map(abs, values)) < _MOST_MM
+    return bend.gain > gain and within and max(sure_ones, default=0.0) > bend.way.least_mm
 
 
 def _told(bend: Bend) -> str:

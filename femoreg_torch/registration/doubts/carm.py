@@ -9,7 +9,7 @@ from torch import Tensor
 from femoreg_torch.fluoro import Display
 from femoreg_torch.geometry import Poses, rotation_angle, transform_points
 from femoreg_torch.registration.evidence.covariance import IntrinsicsEstimate, PoseCovariance
-from femoreg_torch.registration.orbit import orbits
+from femoreg_torch.registration.orbit import orbits, rolled
 from femoreg_torch.registration.quality import Limits, shift_px
 from femoreg_torch.registration.scene import Scene
 
@@ -112,7 +112,7 @@ def doubts_about_the_views(scene: Scene, poses: Poses) -> tuple[str, ...]:
     """Views whose C-arm was found where no orbit leads, in words; none where its poses are given."""
     if scene.camera_from_camera1 is not None:
         return ()
-    orbit = torch.cat(orbits(scene, poses, ORBIT_DEG))
+    orbit = torch.cat([*orbits(scene, poses, ORBIT_DEG), rolled(scene, poses, ORBIT_DEG)])
     isocentre = torch.tensor(scene.carm.isocentre_mm, dtype=torch.float64)
     told = []
     for view, found in enumerate(poses.camera_from_camera1[1:], 2):

@@ -12,13 +12,13 @@ from femoreg_torch.case import Case
 from femoreg_torch.drr import project
 from femoreg_torch.errors import in_mm
 from femoreg_torch.geometry import Poses, transform_points
-from femoreg_torch.registration.evidence.besides import besides, brighter_about, rival
-from femoreg_torch.registration.evidence.sizes import Size, device_size
+from femoreg_torch.registration.evidence.besides import besides, change_about, rival
+from femoreg_torch.registration.evidence.sizes import FURTHEST, Size, device_size
 from femoreg_torch.registration.evidence.tips import TipLength, tip_length
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.materials.calibration import devices
 from femoreg_torch.registration.prepare.models import BEYOND_MM, GUIDE_MM, model_end, told_of_end, told_of_leaning
-from femoreg_torch.registration.scene import Kind, Scene, in_view
+from femoreg_torch.registration.scene import Kind, RigidObject, Scene, in_view
 from femoreg_torch.volume import guide_end
 
 _CASTS_NO_SHADOW = 0.004  # 1/mm: a fifth of water
@@ -94,8 +94,9 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
     """
     found = []
     for name, thing in scene.objects.items():
-        before = told.objects[name].volume.data
-        inside = before > 0.5 * before.max()
+        inside = _casting(told.objects[name])
+        if not inside.any():
+            continue
         empty = inside & (thing.volume.data < _CASTS_NO_SHADOW)
         share = float(empty.sum() / inside.sum())
         if share > _MOST_WITHOUT_SHADOW:
@@ -114,11 +115,17 @@ def doubts_about_the_models(told: Scene, scene: Scene, poses: Poses) -> tuple[st
     return tuple(found)
 
 
+def _casting(told: RigidObject) -> Tensor:
+    """Voxels (Z, Y, X), bool, of an object that casts a shadow by what the case tells of it, part by part."""
+    parts = told.parts or (told.volume,)
+    return torch.stack([part.data > max(0.5 * float(part.data.max()), _CASTS_NO_SHADOW) for part in parts]).any(0)
+
+
 def _where_no_shadow_is(scene: Scene, poses: Poses, name: str, inside: Tensor) -> Scene:
     """The same with only those pixels exposed that have as much light as in the image without the device.
 
-    `inside` (Z, Y, X), bool, is what its model fills. Images that were equalised for display are brighter all about a
-    dark device. Where they are, that is taken off.
+    `inside` (Z, Y, X), bool, is what its model fills. The two images may differ in exposure, and those that were
+    equalised for display are brighter all about a dark device. Both are taken off.
     """
     radius = int(_AVERAGED_MM / scene.carm.camera.mean_pixel_mm / 2)
     filled = replace(scene.objects[name].volume, data=inside.to(scene.objects[name].volume.data))
@@ -133,7 +140,7 @@ def _where_no_shadow_is(scene: Scene, poses: Poses, name: str, inside: Tensor) -
         placed = poses.camera_from(name)[view][None, None]
         path_mm = project([filled], placed, poses.camera(view, scene.carm.camera), _STEP_MM)[0]
         shadow = scene.image(kind, view) - scene.image(first, view)
-        shadow = shadow - brighter_about(scene, poses, name, kind, view)
+        shadow = shadow - change_about(scene, poses, name, kind, view)
         own = (path_mm > 0).to(shadow)
         shadow = averaged(shadow * own) / averaged(own).clamp_min(1e-6)  # not of what lies beside it
         bright = shadow < (_CASTS_NO_SHADOW * path_mm).clamp_max(_NO_SHADOW)
@@ -159,16 +166,17 @@ def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imagi
         words = []
         shown = device_size(scene, poses, name, kind, imaging)
         if shown is not None and _is_off(shown):
+            off = abs(shown.factor - 1)
             words.append(
-                f"the {name} about {100 * abs(shown.factor - 1):.1f} % "
+                f"the {name} about {100 * off:.1f} %{' or more' if off >= FURTHEST else ''} "
                 f"{'larger' if shown.factor > 1 else 'smaller'} than its model, beside the {scene.anchor}"
             )
-        off = _tip_elsewhere(case, told, scene, poses, name, kind, imaging)
-        if off is not None:
-            more = " or more" if abs(off.longer_mm) > _FAR_MM else ""
+        end = _tip_elsewhere(case, told, scene, poses, name, kind, imaging)
+        if end is not None:
+            more = " or more" if abs(end.longer_mm) > _FAR_MM else ""
             words.append(
-                f"the guide of the {name} end {abs(off.longer_mm):.1f} mm{more} "
-                f"{'beyond' if off.longer_mm > 0 else 'before'} the tip of its model"
+                f"the guide of the {name} end {abs(end.longer_mm):.1f} mm{more} "
+                f"{'beyond' if end.longer_mm > 0 else 'before'} the tip of its model"
             )
         if words:
             found.append(
@@ -179,6 +187,8 @@ def doubts_about_size(case: Case, told: Scene, scene: Scene, poses: Poses, imagi
 
 
 def _is_off(shown: Size) -> bool:
+    if (shown.factor - 1) * shown.step.value <= 0:  # one says larger, the other smaller
+        return False
     off = min(abs(shown.factor - 1), abs(shown.step.value))
     return off > _MOST_OFF_SIZE and shown.gain > _LEAST_GAIN_OF_SIZE and shown.step.sureness > _SURE_OF_SIZE
 

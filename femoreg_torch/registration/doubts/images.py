@@ -36,6 +36,17 @@ def _told(scene: Scene, found: Misfit) -> str:
             f"{what} does not show what the other image of that view shows {beside}: check that both were taken "
             "without moving C-arm or patient, and that no images are exchanged"
         )
+    if found.view == 0:
+        return (
+            f"{what} does not show the bones where they were found (similarity {found.similarity:.2f}): check that it "
+            "shows the hip of this patient, and `display` and `intensity` of the view"
+        )
+    if found.found_deg is not None:
+        return (
+            f"{what} does not fit where it was found {beside}, but {found.found_deg:.0f}° from view 1 it does, where "
+            "the preset does not look for it: take the preset fast, which does, or give the C-arm's poses "
+            "(`camera_from_camera1` of the views)"
+        )
     if scene.camera_from_camera1 is not None:
         return (
             f"{what} does not fit at the pose that the case gives {beside}: check `camera_from_camera1` of the "

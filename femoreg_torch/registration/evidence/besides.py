@@ -36,6 +36,7 @@ _LEAST_STEP = 0.5  # of that: by how much a shadow is stronger within its edge t
 _AROUND_MM = 6.0  # on the detector, beside what is drawn: of a pose or model that is a little wrong; and of an edge
 _LEAST_SHARE, _LEAST_MM2 = 0.2, 150.0  # of the device's own shadow, and on the detector
 _SMOOTH_MM, _MOST_BRIGHTER = 15.0, 1.0  # on the detector, standard deviation; of the logarithm of intensity
+_NEARLY_ALL = 0.1  # quantile of a change that is alike all over
 _INSIDE = 0.2  # of the greatest attenuation: what counts as the device
 _MOST_POINTS = 5_000
 _NEAREST_MM, _FARTHEST_MM, _STEP_MM = 4.0, 24.0, 2.0  # along both axes across the device: where another is looked for
@@ -103,17 +104,21 @@ def _change(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> _Ch
     return _Change(camera, with_it - without, drawn & exposed, exposed & ~dilated(drawn, _AROUND_MM, camera))
 
 
-def brighter_about(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Tensor:
-    """How much brighter (H, W), 0 or negative, the image with a device is than the one without it about its shadow.
+def change_about(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Tensor:
+    """How much darker (H, W) the image with a device is than the one without it about its shadow, negative if brighter.
 
-    Of the logarithm of intensity, smoothed over some centimetres, and continued into the shadow.
+    Of the logarithm of intensity. Darker is what nearly all of the image is by its exposure, and not what came beside
+    the device; brighter is what is smoothed over some centimetres, and continued into the shadow.
     """
     image, seen = scene.image(kind, view), _change(scene, poses, name, kind, view)
+    if not seen.elsewhere.any():
+        return torch.zeros_like(image)
     counts = seen.elsewhere.cpu().double().numpy()
-    change = (seen.change.cpu().double().numpy() * counts).clip(-_MOST_BRIGHTER, _MOST_BRIGHTER)
+    exposure = max(0.0, float(seen.change[seen.elsewhere].double().quantile(_NEARLY_ALL)))
+    change = ((seen.change - exposure).cpu().double().numpy() * counts).clip(-_MOST_BRIGHTER, _MOST_BRIGHTER)
     width = _SMOOTH_MM / np.array(seen.camera.pixel_mm)
     summed, weight = (ndimage.gaussian_filter(each, width, mode="constant") for each in (change, counts))
-    smooth = torch.from_numpy((summed / weight.clip(1e-6)).clip(None, 0)).to(image)
+    smooth = torch.from_numpy(exposure + (summed / weight.clip(1e-6)).clip(None, 0)).to(image)
     return F.interpolate(smooth[None, None], tuple(image.shape), mode="bilinear")[0, 0]
 
 

@@ -25,6 +25,7 @@ from femoreg_torch.registration.scene import Scene
 # tilt, slide: by how much slices are shifted along their columns, or their rows, per distance between them
 Way = Literal["stretch", "tilt", "slide"]
 _LEAST: dict[Way, float] = {"stretch": 0.005, "tilt": 0.008, "slide": 0.008}  # that is looked at twice
+_MOST = 0.2  # images that hardly tell a way ask for any amount of it
 # Where rays run along rows of voxels, what is drawn ripples, and costs more than it does from any other direction. So
 # what a CT costs as it is told is the mean of two that are deformed by so little to either side.
 _ASIDE = 0.003
@@ -55,8 +56,8 @@ def ct_shape(scene: Scene, poses: Poses, names: Sequence[str], imaging: Imaging)
         costs.quadratics(costs.still, shapes=[dict.fromkeys(names, rate) for rate in rates.values()])
     )
     found = profile(model, len(rates))
-    steps = -found.scores.sum(0) / found.curvature.diagonal()
-    likely = [(way, float(step)) for way, step in zip(rates, steps, strict=True) if abs(step) > _LEAST[way]]
+    steps = -found.scores.sum(0) / found.curvature.diagonal().clamp_min(0)
+    likely = [(way, float(step)) for way, step in zip(rates, steps, strict=True) if _LEAST[way] < abs(step) < _MOST]
 
     def looked_at_twice(each: tuple[Way, float]) -> Deformation | None:
         way, step = each

@@ -221,4 +221,4 @@ def _step(parts: Sequence[Quadratic], chosen: Sequence[bool], moves: Tensor) -> 
     bends = curvatures > _FLAT * curvatures.max()
     within = torch.where(bends, -along / curvatures, torch.zeros_like(along)).clamp(-_REACH, _REACH)
     gain = -(along * within + curvatures * within.square() / 2).sum()
-    return -inverse @ score, (inverse @ spread @ inverse).diagonal().sqrt(), float(gain)
+    return -inverse @ score, (inverse @ spread @ inverse).diagonal().clamp_min(0).sqrt(), float(gain)

@@ -175,7 +175,7 @@ def bend(
         _displacement(motion, covariance, transform_points(second, of) - other) for of in cut.ends.points
     )
     gain = float(costs(costs.still[None]).mean()) - found.cost
-    return Bend(motion, covariance.diagonal().sqrt(), apart, deviation, gain)
+    return Bend(motion, covariance.diagonal().clamp_min(0).sqrt(), apart, deviation, gain)
 
 
 def gain_as_one(scene: Scene, poses: Poses, name: str, share: float, images: tuple[ImageCosts, ...] | None) -> float:

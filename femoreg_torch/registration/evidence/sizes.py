@@ -29,14 +29,15 @@ _SIMILARITY = GradNcc(patch_radius=5)
 _OPTIMISER = LevenbergMarquardt(max_iterations=8, tol_x=0.05, tol_f=1e-5)
 _SCALE = (0.03, 0.03, 0.03, 2.0, 2.0, 6.0)  # rad and mm: one unit of a motion
 _STEP = 0.02  # sizes that are tried: less, equal, more
-_FURTHEST = 2.0  # steps that a parabola through them is believed
+_LEAST_VIEWS = 2  # of one view any size is another depth
+FURTHEST = 0.04  # from 1, that a parabola through them is believed
 
 
 @dataclass(frozen=True)
 class Size:
     """How large the images show a device."""
 
-    factor: float  # by its model
+    factor: float  # by its model, at most `FURTHEST` off
     gain: float  # of mean patch Grad-NCC, by the best size that was tried
     step: Amount  # by which a step of Newton would enlarge the model, 0.01 for 1 %; 0 where no size gains
 
@@ -46,9 +47,12 @@ def device_size(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imag
 
     Where a thin needle or saturated air leaves the size open, a parabola through the sizes says anything. So the step
     of Newton says how sure that is, the darkness of the device being refitted, by the sandwich estimator over tiles
-    (`registration.evidence.covariance`). None where an image leaves nothing to compare, as where it is all saturated.
+    (`registration.evidence.covariance`). None of one view, and where an image
+    leaves nothing to compare, as where it is all saturated.
     """
     images = scene.there([kind], range(scene.views))
+    if len(images) < _LEAST_VIEWS:
+        return None
     thing = scene.objects[name]
     body = Body((name,), 0, reference_point_in_view(scene, poses, name, 0), torch.tensor(_SCALE, dtype=torch.float64))
     shown = scene.shown(poses.camera1_from, kind)
@@ -65,11 +69,21 @@ def device_size(scene: Scene, poses: Poses, name: str, kind: Kind, imaging: Imag
 
     tried = on_all_cores(fitted, [1 - _STEP, 1.0, 1 + _STEP], scene.device)
     less, equal, more = (found.value for found in tried)
-    steps = parabola_minimum(less, equal, more)
-    steps = 0.0 if math.isnan(steps) else min(max(steps, -_FURTHEST), _FURTHEST)
     gain = equal - min(less, equal, more)
     step = _step(costs, tried[1].delta, name, thing.reference_point) if gain > 0 else Amount(0.0, math.inf)
-    return Size(1 + _STEP * steps, gain, step)
+    return Size(1 + _best(less, equal, more), gain, step)
+
+
+def _best(less: float, equal: float, more: float) -> float:
+    """By how much larger a model costs least, of what it costs smaller, equal and larger by a step; at most `FURTHEST`.
+
+    Where no parabola has its minimum there, as for a device that is far smaller or larger, it is as far as that on the
+    better side.
+    """
+    steps = parabola_minimum(less, equal, more)
+    if math.isnan(steps):
+        steps = math.copysign(math.inf, less - more) if min(less, more) < equal else 0.0
+    return min(max(_STEP * steps, -FURTHEST), FURTHEST)
 
 
 def _step(costs: ImageCosts, delta: Tensor, name: str, centre: Tensor) -> Amount:

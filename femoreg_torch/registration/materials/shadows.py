@@ -13,6 +13,7 @@ the metal, so that its darkest places tell S, and lighter ones the attenuation. 
 the CPU, with SciPy, wherever the scene lies.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -122,7 +123,7 @@ def pairs_of(scene: Scene, kind: Kind) -> list[Pair]:
 
     def unsaturated(k: Kind, view: int) -> Tensor:
         image = scene.image(k, view)
-        return image > image[exposed(k, view)].amin()
+        return image > image.where(exposed(k, view), math.inf).amin()  # where nothing is exposed, no pixel is
 
     def pair(view: int) -> Pair:
         first, camera = scene.first_kind, scene.carm.camera

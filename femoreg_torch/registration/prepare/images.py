@@ -136,8 +136,8 @@ def _told_saturated(found: ByKind) -> tuple[str, ...]:
     if not shares:
         return ()
     return (
-        f"up to {100 * max(shares):.0f} % of an image is saturated: whether something is bent or broken, and what else "
-        "lies beside a device, was not asked there",
+        f"up to {100 * max(shares):.0f} % of an image is saturated: what is bent, broken, or of another size than it "
+        "was told, whether pictures are bent or smeared, and what lies beside a device, was not asked there",
     )
 
 

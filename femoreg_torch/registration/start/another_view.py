@@ -23,7 +23,7 @@ from femoreg_torch.registration.start.by_network import start_in_view_1
 from femoreg_torch.registration.start.find import Detector, look_at, with_segmentations
 from femoreg_torch.registration.start.no_start import best_other_view, why_there_is_no_start
 from femoreg_torch.registration.start.records import record_from_view, record_from_view_1
-from femoreg_torch.registration.step import Step
+from femoreg_torch.registration.step import Step, chosen_kinds
 from femoreg_torch.registration.workflow import run_plan
 
 T = TypeVar("T")
@@ -66,7 +66,7 @@ def _from_another_view(
     if scene.camera_from_camera1 is not None:
         camera1_from = torch.linalg.inv(scene.camera_from_camera1[view]) @ start.camera_from_ct
         return record_from_view(view, scene.anchor, camera1_from, start)
-    there, steps = with_view_first(scene, view), _until_views_are_found(plan)
+    there, steps = with_view_first(scene, view), _until_views_are_found(plan, scene)
     if not steps:
         return None
     if plan.needs_segmentations:
@@ -78,7 +78,10 @@ def _from_another_view(
 
 
 def with_view_first(scene: Scene, view: int) -> Scene:
-    """The images of the first kind alone, those of a view (from 0) first, and then of the others in their order."""
+    """The images of the first kind alone, those of a view (from 0) first, and then of the others in their order.
+
+    What starts where camera 1 has it is shown by none of them, as nobody knows where that is from the other view.
+    """
     order = [view, *(other for other in range(scene.views) if other != view)]
     kind = scene.first_kind
 
@@ -87,6 +90,10 @@ def with_view_first(scene: Scene, view: int) -> Scene:
 
     return replace(
         scene,
+        objects={
+            name: thing if _starts_with_landmarks(scene, name) else replace(thing, shown_in=())
+            for name, thing in scene.objects.items()
+        },
         images=ordered(scene.images),
         fields=ordered(scene.fields),
         saturated=ordered(scene.saturated),
@@ -95,11 +102,21 @@ def with_view_first(scene: Scene, view: int) -> Scene:
     )
 
 
-def _until_views_are_found(plan: Plan) -> tuple[Step, ...]:
-    """The steps of a plan up to the last that looks at each other view by itself; none if there is no such step."""
-    each = [
-        n
-        for n, step in enumerate(plan.steps)
-        if isinstance(step, OrbitSearch) or (isinstance(step, Stage) and step.images == "each other")
-    ]
-    return plan.steps[: each[-1] + 1] if each else ()
+def _starts_with_landmarks(scene: Scene, name: str) -> bool:
+    """Whether landmarks put an object where it starts, or one that it starts beside."""
+    start = scene.objects[name].start
+    return start.camera1_from is None and (start.beside is None or _starts_with_landmarks(scene, start.beside))
+
+
+def _until_views_are_found(plan: Plan, scene: Scene) -> tuple[Step, ...]:
+    """The steps of a plan up to the last that looks at each other view by itself.
+
+    None if there is no such step, or if one looks at other images than the first kind, which shows the bones.
+    """
+    found = 0
+    for number, step in enumerate(plan.steps, 1):
+        if isinstance(step, OrbitSearch) or (isinstance(step, Stage) and step.images == "each other"):
+            if scene.first_kind not in chosen_kinds(step.kinds, scene):
+                return ()
+            found = number
+    return plan.steps[:found]

@@ -21,8 +21,8 @@ from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.plan import Plan
 from femoreg_torch.registration.scene import Scene
 from femoreg_torch.registration.stage import Stage
-from femoreg_torch.registration.start.find import Detector, find_start, look_at
-from femoreg_torch.registration.step import Step
+from femoreg_torch.registration.start.find import Detector, find_start, look_at, with_segmentations
+from femoreg_torch.registration.step import Step, chosen_kinds
 from femoreg_torch.registration.workflow import run_plan
 
 # Of the mean patch Grad-NCC, after the stages of view 1. In five cases of two foreign simulators, with the source in
@@ -40,10 +40,11 @@ def doubts_about_the_display(
     """In words, whether the bones fit view 1 better with the source on the other side, or the picture mirrored.
 
     `told` is the scene before the registration, whose `trace` says how well the bones fit view 1 as the case tells it.
-    Nothing is asked of plans that search view 1 without derivatives, which takes minutes.
+    Nothing is asked of plans that search view 1 without derivatives, which takes minutes, or by images that show more
+    than the bones.
     """
     display = case.display_of(0)
-    steps = tuple(takewhile(_quick_of_view_1, plan.steps))
+    steps = tuple(takewhile(lambda step: _quick_of_view_1(step, told), plan.steps))
     ended = [record.cost for record in trace if steps and record.name == steps[-1].name]
     if display.source not in _FRONT_AND_BACK or not ended:
         return ()
@@ -78,8 +79,10 @@ def doubts_about_head_up(display: Display, camera1_from_ct: Tensor) -> tuple[str
     )
 
 
-def _quick_of_view_1(step: Step) -> bool:
-    return isinstance(step, Stage) and step.images == "first" and isinstance(step.optimiser, LevenbergMarquardt)
+def _quick_of_view_1(step: Step, scene: Scene) -> bool:
+    if not (isinstance(step, Stage) and step.images == "first" and isinstance(step.optimiser, LevenbergMarquardt)):
+        return False
+    return chosen_kinds(step.kinds, scene) == [scene.first_kind]
 
 
 def _cost(case: Case, told: Scene, plan: Plan, find: Detector, display: Display, seed: int) -> float:
@@ -95,13 +98,17 @@ def _cost(case: Case, told: Scene, plan: Plan, find: Detector, display: Display,
         images={kind: (image,)},
         fields={kind: (field,)},
         saturated={},
+        segmentations=(),
         camera_from_camera1=None if told.camera_from_camera1 is None else told.camera_from_camera1[:1],
         left_on_left=(0,) if display.left_on_left else (),
     )
+    seen = look_at(alone, 0, find)
+    if plan.needs_segmentations:
+        alone = with_segmentations(alone, seen, find)
     try:
         start = find_start(
             case.landmarks,
-            look_at(alone, 0, find),
+            seen,
             image,
             camera,
             told.outline,

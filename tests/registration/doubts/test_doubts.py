@@ -12,6 +12,7 @@ from femoreg_torch.case.model import Model
 from femoreg_torch.geometry import Poses, about_point, exp_se3
 from femoreg_torch.registration.doubts.carm import doubts_about_the_views
 from femoreg_torch.registration.doubts.plan import doubts_about_the_guide, doubts_about_the_plan
+from femoreg_torch.registration.orbit import rolled
 from femoreg_torch.registration.scene import Scene
 
 TRUTH = true_poses()
@@ -33,6 +34,11 @@ def test_views_near_the_orbit_are_believed(scene: Scene) -> None:
     assert doubts_about_the_views(scene, TRUTH) == ()
     assert doubts_about_the_views(scene, moved(1, 0.1, 20)) == ()
     assert doubts_about_the_views(scene, moved(1, 0.4, 20)) == ()  # towards head or feet
+
+
+def test_a_view_that_is_rolled_as_far_as_it_is_looked_for_is_believed(scene: Scene) -> None:
+    for camera in rolled(scene, TRUTH, 30)[::5]:
+        assert doubts_about_the_views(scene, TRUTH.with_view(1, camera)) == ()
 
 
 @pytest.mark.parametrize(("rotation", "shift"), [(1.0, 0), (0, 120)])

@@ -12,7 +12,7 @@ from femoreg_torch.drr import project
 from femoreg_torch.geometry import Poses, centred_camera
 from femoreg_torch.registration import Scene
 from femoreg_torch.registration.doubts.device import doubts_beside_devices
-from femoreg_torch.registration.evidence.besides import _across, _share, besides, brighter_about, rival
+from femoreg_torch.registration.evidence.besides import _across, _share, besides, change_about, rival
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.volume import Volume, axis_aligned
 
@@ -105,15 +105,19 @@ def test_a_bone_that_moved_is_not_taken_for_something_else() -> None:
 
 def test_what_equalising_brightens_about_a_device_is_told_and_no_shadow() -> None:
     scene = make_scene(TRUTH)
-    assert brighter_about(scene, TRUTH, "device", "device", 0).abs().max() < 0.01
+    assert change_about(scene, TRUTH, "device", "device", 0).abs().max() < 0.01
     row, column = torch.meshgrid(*[torch.arange(88.0) * 3 - 130] * 2, indexing="ij")
     halo = 0.3 * (-(row**2 + column**2) / (2 * 90.0**2)).exp()
     plain = scene.image("device", 0)
     for change in (-halo, halo):  # brighter, as of equalised images, and darker, as where scattered light came
         changed = replace(scene, images=scene.images | {"device": (plain + change, *scene.images["device"][1:])})
-        found = brighter_about(changed, TRUTH, "device", "device", 0)
+        found = change_about(changed, TRUTH, "device", "device", 0)
         assert found.shape == plain.shape
         torch.testing.assert_close(found, change.clip(max=0).to(found), atol=0.08, rtol=0)
+    for exposure in (-0.2, 0.3):
+        changed = replace(scene, images=scene.images | {"device": (plain + exposure, *scene.images["device"][1:])})
+        found = change_about(changed, TRUTH, "device", "device", 0)
+        torch.testing.assert_close(found, torch.full_like(found, exposure), atol=0.02, rtol=0)
 
 
 def test_what_explains_one_view_alone_is_no_rival() -> None:

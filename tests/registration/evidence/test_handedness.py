@@ -119,6 +119,23 @@ def test_a_model_of_which_a_part_casts_no_shadow_is_doubted(scene: Scene) -> Non
     assert "of the device's volume casts no shadow" in doubt
 
 
+def test_a_light_part_of_a_named_material_that_is_not_there_is_missing(scene: Scene) -> None:
+    """Of the one model of two materials, not of the one of steel alone, whatever the exposure of the images."""
+    steel, plastic, none = (VOLUMES["device"].data.clone() for _ in range(3))
+    steel[:, :, 15:], none[:, :, 15:] = 0, 0
+    plastic[:, :, :15], plastic[:, :, 15:] = 0, 0.1 * plastic[:, :, 15:]
+    parts = tuple(VOLUMES["device"].with_data(data) for data in (steel, plastic))
+    told = with_volume(scene, "device", VOLUMES["device"].with_data(steel + plastic))
+    told = replace(told, objects=told.objects | {"device": replace(told.objects["device"], parts=parts)})
+    estimated = shown(with_volume(told, "device", VOLUMES["device"].with_data(none)))
+    for exposure in (0.0, 0.3, -0.2):
+        device = tuple(estimated.image("device", view) + exposure for view in range(3))
+        exposed = replace(estimated, images={**estimated.images, "device": device})
+        (doubt,) = doubts_about_the_models(told, exposed, TRUTH)
+        assert "of the device's volume casts no shadow" in doubt
+    assert doubts_about_the_models(told, shown(told), TRUTH) == ()
+
+
 def test_a_part_in_whose_place_all_images_show_a_shadow_is_not_missing(scene: Scene) -> None:
     """Metal that lets scattered light through alone looks the same with and without what is in it."""
     data = VOLUMES["device"].data.clone()

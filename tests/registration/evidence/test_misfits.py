@@ -92,6 +92,25 @@ def test_images_of_something_else(scene: Scene) -> None:
         assert says in doubts_about_the_images(strange, [found])[0]
 
 
+def test_a_view_1_that_shows_nothing_of_the_bones_is_told_as_that(scene: Scene) -> None:
+    """All else would be compared with it, and so it is told alone."""
+    noise = torch.rand(scene.image("anatomy", 0).shape, generator=torch.Generator().manual_seed(3))
+    for strange in (noise, 5 - scene.image("anatomy", 0)):
+        (found,) = misfits(with_image(scene, "anatomy", 0, strange), TRUTH, PLAIN)
+        assert (found.kind, found.view) == ("anatomy", 0)
+        (doubt,) = doubts_about_the_images(scene, [found])
+        assert doubt.startswith("the anatomy image of view 1 does not show the bones where they were found")
+
+
+def test_a_view_that_was_not_looked_for_so_far_is_told_with_its_angle(scene: Scene) -> None:
+    """A preset's search may end before it."""
+    astray = TRUTH.with_view(2, TRUTH.camera_from_camera1[2] @ exp_se3(float64(0, 0.9, 0, 0, 0, 0)))
+    (found,) = misfits(scene, astray, PLAIN)
+    assert found.found_deg == pytest.approx(15, abs=3)
+    (doubt,) = doubts_about_the_images(scene, [found])
+    assert f"but {found.found_deg:.0f}° from view 1 it does, where the preset does not look for it" in doubt
+
+
 def test_poses_that_the_case_gives_are_named_where_an_image_does_not_fit(scene: Scene) -> None:
     noise = torch.rand(scene.image("anatomy", 1).shape, generator=torch.Generator().manual_seed(3))
     given = replace(with_image(scene, "anatomy", 1, noise), camera_from_camera1=TRUTH.camera_from_camera1)

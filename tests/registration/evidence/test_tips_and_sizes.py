@@ -22,7 +22,7 @@ from femoreg_torch.registration.doubts.device import (
     notes_on_unseen_tips,
 )
 from femoreg_torch.registration.evidence.bones import Amount
-from femoreg_torch.registration.evidence.sizes import Size, device_size
+from femoreg_torch.registration.evidence.sizes import FURTHEST, Size, _best, device_size
 from femoreg_torch.registration.evidence.tips import TipLength, _near_the_tip, _parted, _stretched, tip_length
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.scene import RigidObject, Scene
@@ -185,6 +185,25 @@ def test_a_tip_that_was_estimated_to_be_empty_is_asked_as_it_was_told(scene: Sce
     case = replace(CASE, objects={"device": CaseObject("device", points={"base": BASE, "tip": tip})})
     (doubt,) = doubts_about_size(case, with_model(scene, tool(63)), estimated, TRUTH, PLAIN)
     assert "before the tip of its model" in doubt
+
+
+def test_costs_that_fall_ever_faster_are_of_a_size_that_is_far_off() -> None:
+    assert _best(0.60, 0.58, 0.52) == FURTHEST
+    assert _best(0.52, 0.58, 0.60) == -FURTHEST
+    assert _best(0.60, 0.58, 0.60) == _best(0.5, 0.5, 0.5) == 0
+    assert _best(0.60, 0.58, 0.58) == pytest.approx(0.01)
+
+
+def test_one_view_tells_no_size(scene: Scene) -> None:
+    one = replace(scene, images={kind: (images[0], None, None) for kind, images in scene.images.items()})
+    assert device_size(one, TRUTH, "device", "device", PLAIN) is None
+
+
+def test_sizes_that_contradict_each_other_are_not_told(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    for sign, told in ((1, 1), (-1, 0)):
+        size = Size(1.03, 0.01, Amount(0.03 * sign, 0.005))
+        monkeypatch.setattr("femoreg_torch.registration.doubts.device.device_size", lambda *_, size=size: size)
+        assert len(doubts_about_size(CASE, scene, scene, TRUTH, PLAIN)) == told
 
 
 @pytest.mark.parametrize(("factor", "words"), [(1.03, "smaller"), (0.97, "larger")])

@@ -11,7 +11,7 @@ import trimesh
 from femoreg_torch.case import Start
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import CArm, Poses, about_point, centred_camera, exp_se3, pose_difference, rigid
-from femoreg_torch.registration.materials.calibration import Calibration
+from femoreg_torch.registration.materials.calibration import Calibration, devices
 from femoreg_torch.registration.materials.device_fit import fit_device
 from femoreg_torch.registration.materials.regions import (
     blocks_of,
@@ -131,7 +131,7 @@ def test_the_images_tell_how_much_metal_hardens_the_beam() -> None:
     for spectrum in (np.ones(1), SPECTRUM, wide):
         scene = make_scene(0.4, 0.4, spectrum=spectrum)
         scene = replace(scene, objects=scene.objects | {"device": replace(scene.objects["device"], sharp=True)})
-        after, record = Calibration("materials").calibrate(scene, poses())
+        after, record, _ = Calibration("materials").calibrate(scene, poses())
         hardening = after.objects["device"].hardening
         assert f"hardening {hardening:.2f}" in record.stop
         found.append(hardening)
@@ -176,7 +176,7 @@ def test_residuals_have_the_derivatives_that_they_say(mixed: Scene) -> None:
 
 def test_a_device_that_is_as_the_case_says_stays_so() -> None:
     scene = make_scene(0.15, 0.15)
-    after, record = Calibration("materials").calibrate(scene, poses())
+    after, record, _ = Calibration("materials").calibrate(scene, poses())
     assert torch.equal(after.objects["device"].volume.data, scene.objects["device"].volume.data)
     assert after.objects["device"].unsure == ()
     assert after.objects["device"].hardening > 0
@@ -191,7 +191,7 @@ def test_materials_are_known_where_they_were_named_and_the_images_agree(dense: f
     scene = make_scene(dense, 0.15 if dense == 0.15 else LIGHT)
     device = replace(scene.objects["device"], materials_known=named)
     scene = replace(scene, objects=scene.objects | {"device": device})
-    after, _ = Calibration("materials").calibrate(scene, poses())
+    after, _, _ = Calibration("materials").calibrate(scene, poses())
     assert after.objects["device"].materials_known == known
 
 
@@ -253,7 +253,7 @@ def test_a_device_that_is_seen_through_tells_no_scatter() -> None:
 def test_images_before_the_device_that_show_no_object_do_as_well(mixed: Scene) -> None:
     """A tool over whatever lies there: nothing is known of that, and the images without the tool hold it."""
     alone = replace(mixed, objects={"device": mixed.objects["device"]})
-    found, _ = Calibration("materials").calibrate(
+    found, _, _ = Calibration("materials").calibrate(
         alone, replace(poses(), camera1_from={"device": poses().camera1_from["device"]})
     )
     assert float(found.objects["device"].volume.data.max()) > 0.4
@@ -263,6 +263,33 @@ def test_without_images_of_the_device_there_is_nothing_to_do(mixed: Scene) -> No
     alone = replace(mixed, images={"anatomy": mixed.images["anatomy"]})
     assert "no device" in (Calibration("materials").left_out(alone, poses()) or "")
     assert Calibration("materials").left_out(mixed, poses()) is None
+
+
+def test_a_device_that_two_kinds_of_images_show_is_estimated_by_the_first(mixed: Scene) -> None:
+    """By the second it would be asked with what was estimated in the place of its shares of voxels."""
+    device = replace(mixed.objects["device"], shown_in=("device", "later"))
+    twice = replace(
+        mixed,
+        objects=mixed.objects | {"device": device},
+        images=mixed.images | {"later": mixed.images["device"]},
+    )
+    assert devices(twice, poses()) == [("device", "device")]
+
+
+def test_two_devices_in_one_kind_of_images_are_told_as_that(mixed: Scene) -> None:
+    both = replace(mixed, objects=mixed.objects | {"second": mixed.objects["device"]})
+    there = replace(poses(), camera1_from=poses().camera1_from | {"second": poses().camera1_from["device"]})
+    assert devices(both, there) == []
+    assert "several devices at once" in (Calibration("materials").left_out(both, there) or "")
+
+
+def test_a_device_that_was_not_estimated_is_told(mixed: Scene) -> None:
+    hidden = {"device": tuple(torch.zeros_like(image, dtype=torch.bool) for image in mixed.images["device"])}
+    after, _, notes = Calibration("materials").calibrate(replace(mixed, fields=hidden), poses())
+    assert after.objects["device"] is mixed.objects["device"]
+    assert notes == (
+        "attenuation of the device not estimated, as no view shows enough of it: it is drawn as the case tells it",
+    )
 
 
 def test_logarithms_of_unknown_base_do_not_tell_materials(mixed: Scene) -> None:
@@ -297,7 +324,7 @@ def test_a_device_that_no_view_shows_stays_as_it_is(mixed: Scene) -> None:
     away = poses()
     far = rigid(translation=torch.tensor([400.0, 0.0, 0.0], dtype=torch.float64))
     away = away.with_object("device", far @ away.camera1_from["device"])
-    after, record = Calibration("materials").calibrate(mixed, away)
+    after, record, _ = Calibration("materials").calibrate(mixed, away)
     assert after.objects["device"] is mixed.objects["device"]
     assert torch.equal(record.poses.camera1_from["device"], away.camera1_from["device"])
     assert "not estimated" in record.stop

@@ -9,6 +9,7 @@ from registration_scenes import CARM, REFERENCE_POINTS, error, make_scene, off, 
 from torch import Tensor
 
 from femoreg_torch.case import Case, StartRecord, View
+from femoreg_torch.case import Start as CaseStart
 from femoreg_torch.detect import Detection
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, rigid
@@ -73,6 +74,16 @@ def started(
     return start
 
 
+def test_a_plan_that_finds_views_by_the_device_finds_none_from_another(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The device is told in camera 1, and nobody knows where that is. What view 1 shows itself stays."""
+    by_device = load_plan("device_fiducial")
+    assert torch.equal(started(scene, by_device, monkeypatch, "few", other=2).camera1_from_object, FOUND)
+    with pytest.raises(InputError, match=r"view1.tif: 3 usable"):
+        started(scene, by_device, monkeypatch, None, other=2)
+
+
 @pytest.mark.parametrize("view_1", [None, "few"])
 def test_view_1_is_found_from_a_view_that_shows_more(
     scene: Scene, plan: Plan, monkeypatch: pytest.MonkeyPatch, view_1: str | None
@@ -121,6 +132,14 @@ def test_where_the_carm_is_known_it_tells_view_1(scene: Scene, plan: Plan, monke
     there = Poses(TRUTH.camera_from_camera1, {"pelvis": start.camera1_from_object})
     expected = off(TRUTH.camera_from("pelvis")[1], REFERENCE_POINTS["pelvis"], (1.2, -1.2, 1.2), (1, -1, 8))
     torch.testing.assert_close(there.camera_from("pelvis")[1], expected)
+
+
+def test_what_starts_in_camera_1_is_not_drawn_from_another_view(scene: Scene) -> None:
+    """Nobody knows where camera 1 is from there."""
+    everywhere = {name: replace(thing, shown_in=("anatomy",)) for name, thing in scene.objects.items()}
+    tip = replace(everywhere["device"], start=CaseStart(beside="device"))
+    there = with_view_first(replace(scene, objects=everywhere | {"tip": tip}), 1)
+    assert set(there.start(TRUTH.camera1_from["pelvis"]).camera1_from) == {"pelvis", "femur"}
 
 
 def test_images_masks_and_sides_are_put_in_the_order_of_the_views(scene: Scene) -> None:

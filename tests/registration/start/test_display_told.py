@@ -12,7 +12,7 @@ from femoreg_torch.case import Case, StageRecord, View
 from femoreg_torch.errors import InputError
 from femoreg_torch.fluoro import Display
 from femoreg_torch.pnp import PnpResult
-from femoreg_torch.registration import load_plan
+from femoreg_torch.registration import Stage, load_plan
 from femoreg_torch.registration.start import display_told
 from femoreg_torch.registration.start.display_told import doubts_about_head_up, doubts_about_the_display
 from femoreg_torch.registration.start.find import Start
@@ -22,7 +22,12 @@ LAST_OF_VIEW_1 = "pelvis and femur in view 1"
 
 
 def doubts_of(
-    monkeypatch: pytest.MonkeyPatch, stored_as: Display, told_as: Display, cost: float, start: bool = True
+    monkeypatch: pytest.MonkeyPatch,
+    stored_as: Display,
+    told_as: Display,
+    cost: float,
+    start: bool = True,
+    kinds: str = "anatomy",
 ) -> tuple[str, ...]:
     """Doubts where view 1 is stored one way and told another, and the bones fitted with this cost as it was told.
 
@@ -46,6 +51,8 @@ def doubts_of(
     case = Case(Path("case"), CARM, {}, views=(View({"anatomy": Path("view1.tif")}, display=told_as),) * 3)
     trace = [StageRecord(LAST_OF_VIEW_1, 1, cost, 1, 0.0, "", TRUTH)]
     plan = quicker(load_plan("fast"))
+    steps = tuple(replace(step, kinds=[kinds]) if isinstance(step, Stage) else step for step in plan.steps)
+    plan = replace(plan, steps=steps)
     return doubts_about_the_display(case, scene, plan, lambda *_: None, trace, seed=0)  # type: ignore[arg-type,return-value]
 
 
@@ -70,6 +77,7 @@ def test_a_display_that_fits_no_better_is_not_named(monkeypatch: pytest.MonkeyPa
     assert doubts_of(monkeypatch, *behind, cost=0.0) == ()  # nothing can fit better
     assert doubts_of(monkeypatch, *behind, cost=0.9, start=False) == ()
     assert doubts_of(monkeypatch, Display("posterior"), Display("left"), cost=0.9) == ()
+    assert doubts_of(monkeypatch, *behind, cost=0.9, kinds="device") == ()  # stages that do not look at the bones
 
 
 @pytest.mark.parametrize(("turned", "right"), [(0, 180), (90, 270), (270, 90)])
