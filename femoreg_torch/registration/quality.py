@@ -51,8 +51,8 @@ class Limits:
     least_gain: float = 0.004  # of mean patch NCC, when the object is drawn
     most_pull_mm: float = 1.5  # of a single view in its image plane
     # Of all images together, were all that is registered free to move: of the anchor, and of other objects beside it.
-    # In depth the anchor's may be larger: images of other simulators pulled right results by 1.0 to 1.9 mm, all objects
-    # alike, with their poses off by 0.1 to 0.7 mm; a result 4 mm off in depth was pulled by more than 2 mm.
+    # In depth the anchor may be pulled farther. Images of other simulators pulled right results, off by 0.1 to 0.7 mm,
+    # by 1.0 to 1.9 mm in depth, all objects together. A result that was 4 mm off in depth was pulled by more than 2 mm.
     most_common_pull_mm: float = 1.0
     most_common_pull_deg: float = 1.0
     most_common_depth_pull_mm: float = 2.0
@@ -63,9 +63,11 @@ class Limits:
     # 0.006 and more in 14 of two others, and were 0.2° off at most. Those that no image told lost 0.0004 at most, and
     # were up to 7° off; where one view showed a corner of a plastic handle alone, 0.0031, and the turn was 3.6° off.
     least_loss_by_turning: float = TOLD / 2
-    rival_cost: float = 0.005  # another start of a stage that ended so little above the best,
-    rival_deg: float = 15.0  # but so far away
-    rival_mm: float = 50.0  # or so far, is a rival; what is nearer, the following stages tell apart
+    # A start of a stage is a rival of the best one if it ended with a cost so little above that, and so far from it by
+    # the turn or the place; what is nearer, the following stages tell apart.
+    rival_cost: float = 0.005
+    rival_deg: float = 15.0
+    rival_mm: float = 50.0
     most_displacement_mm: float = (
         8.0  # from the place beside the object that it starts beside; joints do not gape so far
     )

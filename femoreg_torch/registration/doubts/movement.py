@@ -60,9 +60,9 @@ def doubts_about_motion(
 ) -> tuple[str, ...]:
     """Anatomy that lies elsewhere in images of another kind, or a device that moved between the views, in words.
 
-    `alone` tells what fitting a device in one view by itself gains, see `evidence.fitted_alone`, and `finer` how far
-    bones are turned in their joints as finer pixels have it. Where the poses of the C-arm were `given`, these may be
-    off as well.
+    `alone` tells what is gained where a device is fitted in one view by itself, see `evidence.fitted_alone`. `finer`
+    tells by finer pixels how far bones are turned in their joints. Where the poses of the C-arm were `given`, these may
+    be off as well.
 
     Where both explain the images, what explains them better. A single bone or device counts if it is sure by itself:
     the depth of a bone in one view is so open that it may gain more where a device has moved.

@@ -41,7 +41,7 @@ class Bend:
 
     way: Way
     amounts: tuple[Amount, ...]  # mm on the detector
-    gain: float  # share of the cost
+    gain: float  # share of the costs of all first images that is saved
 
 
 def towards_the_rim(camera: Camera) -> Tensor:

@@ -72,8 +72,10 @@ class Besides:
 class Rival:
     """Another place where a device fits the images with it."""
 
-    apart_mm: float  # across its long axis
-    share: float  # of the similarity that the device adds where it was found, but for the view that it gains most in
+    apart_mm: float  # across the long axis of the device, in camera 1
+    # of the similarity that the device adds where it was found, without the view that gains most at the other place;
+    # above 1 where it fits better there
+    share: float
 
 
 def besides(scene: Scene, poses: Poses, name: str, kind: Kind) -> list[Besides]:

@@ -15,8 +15,8 @@ image count by themselves, and the limits of what is doubted were chosen so. Ref
 would answer by J = −Hxx⁻¹ Hxq. What remains of the images with the poses refitted, S = Hqq + Hqx J with scores
 r = s_q + Jᵀ s_x, informs of q by S R⁻¹ S with R = Σ r rᵀ, the inverse of their own sandwich. With the
 prior this gives a mean m and a covariance P of q. The intrinsics q0 that the poses were found with are off by
-P + (m − q0)(m − q0)ᵀ in the mean square, and the covariance of the poses is Hxx⁻¹ G Hxx⁻¹ + J (P + …) Jᵀ. So
-intrinsics that were refined count with what the images leave open, and others also with how badly the images fit them.
+P + (m − q0)(m − q0)ᵀ in the mean square, and the covariance of the poses is Hxx⁻¹ G Hxx⁻¹ + J (P + …) Jᵀ. So of
+intrinsics that were refined, what the images leave open counts. Of others it also counts how badly the images fit them.
 
 Where the materials of a device were estimated, some of it is taken for what lies beside it
 (`registration.materials.device_fit`). These mistakes are nuisance parameters m too, with covariance 1. What the

@@ -36,8 +36,8 @@ class Deformation:
     """How the images would deform the bones of a CT in one way, and by how much less they cost then."""
 
     way: Way
-    amount: Amount
-    gain: float  # share of the cost
+    amount: Amount  # as a share: 0.01 for 1 %
+    gain: float  # share of the costs of all first images that is saved
 
 
 def ct_shape(scene: Scene, poses: Poses, names: Sequence[str], imaging: Imaging) -> tuple[Deformation, ...]:

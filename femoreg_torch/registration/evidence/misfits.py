@@ -43,6 +43,7 @@ _SEARCH = OrbitSearch(
     further_deg=100,
     further_above=0.6,
 )
+# What makes an image fit, named as the case has to tell it: one that was stored turned clockwise is turned back.
 _CHANGES: dict[str, Callable[[Tensor], Tensor]] = {
     "mirrored": lambda image: image.flip(1),
     "turned by 180°": lambda image: image.rot90(2),
@@ -61,7 +62,7 @@ class Misfit:
     similarity: float  # mean patch Grad-NCC, at most 1
     in_view_1: float  # of the first image of view 1
     as_view: int | None = None  # (from 0) whose pose explains it
-    as_stored: str | None = None  # how it has to be changed so that it fits
+    as_stored: str | None = None  # how it is stored, by what makes it fit
     found_deg: float | None = None  # from view 1, where it fits as it is, though it was not found there
 
 

@@ -39,7 +39,9 @@ class MotionBetween:
     objects: tuple[str, ...]  # that move together
     motion: Tensor  # (6,) degrees and mm, about the first object's reference point, along the axes of camera 1
     deviation: Tensor  # (6,)
-    gain: float  # by which the motion, or what of it is in reach, lowers the cost: what has really moved gains the most
+    # by which the motion, or what of it is in reach, lowers the costs of all images together: what has really moved
+    # gains the most
+    gain: float
 
     @cached_property
     def size(self) -> tuple[float, float]:
@@ -60,7 +62,7 @@ class JointTurn:
     name: str
     degrees: float
     sureness: float  # the turn by its standard deviations: the most certain of its three parts
-    gain: float  # by which it lowers the cost
+    gain: float  # by which it lowers the costs of all images together
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class GuideDrift:
     turns: bool  # about the guide, by degrees; else it slides along it, towards the tip, by mm
     amount: float
     deviation: float
-    gain: float  # by which it lowers the cost
+    gain: float  # by which it lowers the costs of all images together
 
     @property
     def sureness(self) -> float:

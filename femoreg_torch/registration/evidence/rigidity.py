@@ -51,8 +51,8 @@ class Bend:
     motion: Tensor  # (6,) degrees and mm, about the middle of the cut, along the axes of camera 1
     deviation: Tensor  # (6,)
     apart_mm: float  # by which points of the end that moves less are moved on average, as far as images show them
-    apart_deviation_mm: float
-    gain: float  # of similarity, by both ends together
+    apart_deviation_mm: float  # of that
+    gain: float  # of mean patch Grad-NCC over the images that show the object, by both ends together
 
     @property
     def angle_deg(self) -> float:
