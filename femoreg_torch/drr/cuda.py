@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from femoreg_torch.derivatives import first_order
 from femoreg_torch.drr.bricks import RIM
 from femoreg_torch.drr.device_bricks import bricked_on_device, padded_shape
 from femoreg_torch.geometry.camera import Camera
@@ -123,7 +123,7 @@ class _Projection(torch.autograd.Function):
         return image
 
     @staticmethod
-    @once_differentiable
+    @first_order("an image of `project`")
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         affines, offsets = ctx.saved_tensors
         scene = (ctx.volume, affines, ctx.camera, offsets, ctx.step_mm, ctx.tile)

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from femoreg_torch.derivatives import first_order
 from femoreg_torch.drr import cpu, cuda
 from femoreg_torch.drr.bricks import bricked
 from femoreg_torch.drr.moments import affine_gradient, offset_gradient, unit_rays
@@ -301,7 +301,7 @@ class _CpuProjection(torch.autograd.Function):
         return torch.from_numpy(image)
 
     @staticmethod
-    @once_differentiable
+    @first_order("an image of `project`")
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         affines, offsets, moments = ctx.saved_tensors
         weights = upstream.to(torch.float32)

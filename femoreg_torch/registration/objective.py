@@ -46,6 +46,16 @@ def stage_objective(costs: ImageCosts, bodies: tuple[Moving, ...], prior: Prior 
     return SmoothObjective(values, quadratic)
 
 
+def along_ways(objective: SmoothObjective, ways: Tensor) -> SmoothObjective:
+    """An objective of how far (m,) its unknowns (n,) go along some ways (n, m) alone."""
+
+    def quadratic(delta: Tensor) -> Quadratic:
+        model = objective.quadratic(ways @ delta)
+        return Quadratic(model.value, model.scores @ ways, ways.T @ model.hessian @ ways)
+
+    return SmoothObjective(lambda deltas: objective.values(deltas @ ways.T), quadratic)
+
+
 def image_quadratic(costs: ImageCosts, delta: Tensor) -> Quadratic:
     """Mean cost over the images about one delta (Σ n_b,), without penalties."""
     return mean_quadratic(costs.quadratics(delta))

@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from femoreg_torch.derivatives import first_order
 from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import cpu, cuda
 from femoreg_torch.similarity.checks import check_patches, check_size, check_weights, check_whole
@@ -170,7 +170,7 @@ class _CpuGradNcc(torch.autograd.Function):
         return torch.from_numpy(values).mean(-1)
 
     @staticmethod
-    @once_differentiable
+    @first_order("a cost of GradNcc")
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
         (images,) = ctx.saved_tensors
         arguments = _CpuGradNcc._arguments(ctx.similarity)
@@ -186,11 +186,11 @@ class _CudaGradNcc(torch.autograd.Function):
         if not ctx.needs_input_grad[0]:
             return cuda.grad_ncc(images, similarity)
         values, gradient = cuda.grad_ncc_and_gradient(images, similarity)
-        ctx.save_for_backward(gradient)
+        ctx.save_for_backward(gradient, images)
         return values
 
     @staticmethod
-    @once_differentiable
+    @first_order("a cost of GradNcc")
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
-        (gradient,) = ctx.saved_tensors
+        gradient, _ = ctx.saved_tensors
         return upstream.to(gradient)[:, None, None] * gradient, None

@@ -40,9 +40,16 @@ def everything(rows: pd.DataFrame, column: str) -> np.ndarray:
 
 
 def object_is_wrong(rows: pd.DataFrame, name: str) -> pd.Series:
-    """Of every run: whether an object is off by more than 4 mm or 2°, or is not placed though it should be."""
-    right = (told(rows, f"{name}_mm") <= WRONG_MM) & (told(rows, f"{name}_deg") <= WRONG_DEG)
-    return asked(rows, f"{name}_mm") & ~right
+    """Of every run: whether an object is off by more than 4 mm or 2°, or is not placed though it should be.
+
+    Of the two, what no run tells was not measured, and is not asked.
+    """
+    wrong = pd.Series(False, rows.index)
+    for column, limit in ((f"{name}_mm", WRONG_MM), (f"{name}_deg", WRONG_DEG)):
+        errors = told(rows, column)
+        if errors.notna().any():
+            wrong |= asked(rows, column) & ~(errors <= limit)
+    return wrong
 
 
 def run_is_wrong(rows: pd.DataFrame, objects: Sequence[str] = OBJECTS) -> pd.Series:

@@ -21,12 +21,12 @@ from torch import Tensor
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses, log_so3, transform_points
 from femoreg_torch.geometry.rigid import skew
-from femoreg_torch.optimize import LevenbergMarquardt, Quadratic, SmoothObjective
+from femoreg_torch.optimize import LevenbergMarquardt
 from femoreg_torch.registration.costs import ImageCosts, image_costs
 from femoreg_torch.registration.evidence.turns import TOLD, long_axis
 from femoreg_torch.registration.imaging import Imaging
 from femoreg_torch.registration.level import Level
-from femoreg_torch.registration.objective import image_quadratic, stage_objective
+from femoreg_torch.registration.objective import along_ways, image_quadratic, stage_objective
 from femoreg_torch.registration.scene import Body, Kind, RigidObject, Scene, moved, shown_by
 from femoreg_torch.similarity import GradNcc
 from femoreg_torch.volume import Volume
@@ -100,7 +100,7 @@ class _Cut:
         """Where the ends fit, from their poses, as far as they go along some ways (12, n)."""
         for number in range(len(_LEVELS)):
             bodies, costs = self.asked(poses, number)
-            objective = _along(stage_objective(costs, bodies, None), ways)
+            objective = along_ways(stage_objective(costs, bodies, None), ways)
             delta = ways @ _OPTIMISER.minimise(objective, ways.shape[1], seed=0).delta
             poses = moved(poses, bodies, delta)
         model = image_quadratic(costs, delta)
@@ -212,16 +212,6 @@ def _loses_little(costs: ImageCosts, about: Tensor) -> list[bool]:
     far = math.radians(_TURN_DEG) * about
     still, *turned = costs(torch.cat([costs.still[None], far, -far])).mean(1).tolist()
     return [min(pair) - still < TOLD for pair in zip(turned[: len(about)], turned[len(about) :], strict=True)]
-
-
-def _along(objective: SmoothObjective, ways: Tensor) -> SmoothObjective:
-    """An objective of how far its unknowns go along some ways (n, m) alone."""
-
-    def quadratic(delta: Tensor) -> Quadratic:
-        model = objective.quadratic(ways @ delta)
-        return Quadratic(model.value, model.scores @ ways, ways.T @ model.hessian @ ways)
-
-    return SmoothObjective(lambda deltas: objective.values(deltas @ ways.T), quadratic)
 
 
 def _displacement(motion: Tensor, covariance: Tensor, arms: Tensor) -> tuple[float, float]:
