@@ -76,6 +76,11 @@ def _named(value: Any) -> bool:
     return isinstance(value, list) and bool(value) and all(isinstance(v, dict) and "name" in v for v in value)
 
 
+def _listed(names: list[Any]) -> str:
+    """Names in quotes, as they may hold commas."""
+    return ", ".join(f"“{name}”" for name in names)
+
+
 def _merged(base: list[dict[str, Any]], changes: list[dict[str, Any]], where: str) -> list[dict[str, Any]]:
     entries = list(base)
     told = [change["name"] for change in changes]
@@ -88,9 +93,12 @@ def _merged(base: list[dict[str, Any]], changes: list[dict[str, Any]], where: st
         remove = entry.pop("remove", False)
         for name in [other for _, other in beside] + ([entry["name"]] if remove else []):
             if name not in names:
-                raise InputError(
-                    f"{where}: there is no entry named {shortened(name)}; there are: {', '.join(map(str, names))}."
-                )
+                raise InputError(f"{where}: there is no entry named {shortened(name)}; there are: {_listed(names)}.")
+        if entry["name"] not in names and "kind" not in entry and all("kind" in other for other in entries):
+            raise InputError(
+                f"{where}: there is no entry named {shortened(entry['name'])} to change, and a new one needs `kind`; "
+                f"there are: {_listed(names)}."
+            )
         if entry["name"] in names:
             place = names.index(entry["name"])
             old = entries.pop(place)

@@ -9,14 +9,15 @@ The class is a frozen dataclass of settings; the other keys beside `kind` are it
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
 from types import FunctionType
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
-from femoreg_torch.errors import InputError, shortened
+from femoreg_torch.errors import InputError, defect_in_one_line, shortened
 from femoreg_torch.settings import read_record
 
+_T = TypeVar("_T")
 Group = Literal[
     "femoreg_torch.similarities",
     "femoreg_torch.optimisers",
@@ -55,6 +56,29 @@ def name_of(group: Group, thing: Any) -> str:
     value = f"{named.__module__}:{named.__qualname__}"
     kinds = [entry.name for entry in entry_points(group=group) if entry.value == value]
     return f"{kinds[0]} ({value})" if kinds else value
+
+
+def is_built_in(thing: Any) -> bool:
+    """Whether an object is of a class of this package."""
+    return type(thing).__module__.startswith("femoreg_torch.")
+
+
+def guarded(what: str, group: Group, thing: Any, work: Callable[[], _T]) -> _T:
+    """What `work`, a call of `thing`, gives.
+
+    Raises `InputError` that names an object of another package, `what` it is and its class, for whatever goes wrong in
+    it. Only what is out of memory stays what it is.
+    """
+    if is_built_in(thing):
+        return work()
+    import torch  # here, as much of what reads presets needs none of it
+
+    try:
+        return work()
+    except (InputError, MemoryError, torch.cuda.OutOfMemoryError):
+        raise
+    except Exception as error:  # the code of others raises whatever it runs into
+        raise InputError(f"{what} {name_of(group, thing)}: raised {defect_in_one_line(error)}.") from error
 
 
 def pop_kind(content: Any, where: str) -> tuple[str, dict[str, Any]]:

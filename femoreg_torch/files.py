@@ -9,7 +9,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,12 @@ def temporary_files(*paths: Path) -> Iterator[tuple[Path, ...]]:
                 elif path not in there:
                     path.unlink(missing_ok=True)
             raise
+
+
+def check_suffix(path: Path, suffixes: Sequence[str]) -> None:
+    """Raises `InputError` for a name that does not end in one of `suffixes`, by which a file is recognised later."""
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: a name that ends in {' or '.join(suffixes)} was expected.")
 
 
 def check_files(*paths: Path) -> None:

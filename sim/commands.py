@@ -15,14 +15,16 @@ def phantom(out: Path, *, seed: int = 1, side: Literal["left", "right"] = "left"
     """
     from rich.console import Console
 
+    from femoreg_torch.commands.telling import in_place_of
     from femoreg_torch.files import check_new_folder
     from sim.theatre.case_folders import write_phantom
 
     check_new_folder(out)
+    before = in_place_of(out)
     console = Console()
     with console.status("building the patient"):
         write_phantom(out, seed, side, spacing_mm)
-    console.print(f"Patient {seed} written to {out}")
+    console.print(f"Patient {seed} written to {out}{before}")
 
 
 def around_surfaces(
@@ -47,14 +49,16 @@ def around_surfaces(
     """
     from rich.console import Console
 
+    from femoreg_torch.commands.telling import in_place_of
     from femoreg_torch.files import check_new_folder
     from sim.patient.around_surfaces import Options, write_patient_around
 
     check_new_folder(out)
+    before = in_place_of(out)
     console = Console()
     with console.status("building the patient"):
         write_patient_around(surfaces, out, Options(seed, spacing_mm, osteoporotic, below_mm))
-    console.print(f"Patient around {surfaces} written to {out}")
+    console.print(f"Patient around {surfaces} written to {out}{before}")
 
 
 def around_labels(label_map: Path, *, out: Path, labels: str, seed: int = 1, spacing_mm: float = 1.0) -> None:
@@ -71,15 +75,17 @@ def around_labels(label_map: Path, *, out: Path, labels: str, seed: int = 1, spa
     from rich.console import Console
 
     from femoreg_torch.anatomy import label_table
+    from femoreg_torch.commands.telling import in_place_of
     from femoreg_torch.files import check_new_folder
     from sim.patient.from_labels import write_label_patient
 
     check_new_folder(out)
+    before = in_place_of(out)
     table = label_table(labels)
     console = Console()
     with console.status("building the patient"):
         write_label_patient(label_map, table, out, seed, spacing_mm)
-    console.print(f"Patient around {label_map} written to {out}")
+    console.print(f"Patient around {label_map} written to {out}{before}")
 
 
 def simulate(
@@ -106,7 +112,7 @@ def simulate(
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     from femoreg_torch.case import case_folder
-    from femoreg_torch.commands.telling import tell_device
+    from femoreg_torch.commands.telling import in_place_of, tell_device
     from femoreg_torch.files import check_new_folder
     from sim.theatre.case_folders import SIMULATION_STEPS, write_simulation
 
@@ -114,6 +120,7 @@ def simulate(
     place = tell_device(console, device)
     case = case_folder(case)
     check_new_folder(out, case)
+    before = in_place_of(out)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task("reading the patient", total=SIMULATION_STEPS)
@@ -122,7 +129,7 @@ def simulate(
             progress.update(task, advance=1, description=step)
 
         write_simulation(case, out, seed, side, config, report, device=place)
-    console.print(f"Simulated case {seed} written to {out} (look at {out / 'preview.png'})")
+    console.print(f"Simulated case {seed} written to {out}{before} (look at {out / 'preview.png'})")
 
 
 def dataset(config: str, *, out: Path) -> None:
@@ -134,12 +141,16 @@ def dataset(config: str, *, out: Path) -> None:
     """
     from rich.console import Console
 
+    from femoreg_torch.commands.telling import in_place_of
+    from femoreg_torch.files import check_suffix
     from sim.labelled.deepfluoro import write_dataset
 
+    check_suffix(out, (".h5", ".hdf5"))
+    before = in_place_of(out)
     console = Console()
     with console.status("reading the settings") as status:
         write_dataset(config, out, lambda source: status.update(f"imaging {source}"))
-    console.print(f"Simulated data set written to {out}")
+    console.print(f"Simulated data set written to {out}{before}")
 
 
 def labelled_images(
@@ -157,12 +168,16 @@ def labelled_images(
     """
     from rich.console import Console
 
+    from femoreg_torch.commands.telling import in_place_of
+    from femoreg_torch.files import check_suffix
     from sim.labelled.image_files import write_labelled_images
 
+    check_suffix(out, (".safetensors",))
+    before = in_place_of(out)
     console = Console()
     with console.status(f"imaging {patient}"):
         write_labelled_images(patient, out, config, count, seed, name)
-    console.print(f"{count} labelled images written to {out}")
+    console.print(f"{count} labelled images written to {out}{before}")
 
 
 def study(

@@ -20,10 +20,11 @@ from femoreg_torch.similarity import SmoothFixedSimilarity, against_field, simil
 from femoreg_torch.volume import Volume, axis_aligned
 
 MODULE = """
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
+from femoreg_torch.case import StageRecord
 from femoreg_torch.optimize import Result, Stop
 
 
@@ -66,6 +67,35 @@ class Grid:
 
 
 @dataclass(frozen=True)
+class Lost:
+    how: str
+
+    def minimise(self, objective, n, seed):
+        delta = torch.zeros(n, dtype=torch.float64)
+        if self.how == "raises":
+            return {}["boom"]
+        if self.how == "none":
+            return None
+        return Result(delta[:1] if self.how == "short" else delta * float("nan"), 0.0, Stop.BUDGET, 1)
+
+
+@dataclass(frozen=True)
+class Bad:
+    name: str
+    how: str
+
+    def left_out(self, scene, poses):
+        return None
+
+    def run(self, scene, poses, seed):
+        if self.how == "raises":
+            raise KeyError("boom")
+        if self.how == "scales":
+            scaled = {name: pose * 2 for name, pose in poses.camera1_from.items()}
+            yield StageRecord(self.name, None, 0.0, 1, 0.0, "", replace(poses, camera1_from=scaled))
+
+
+@dataclass(frozen=True)
 class Nothing:
     name: str
 
@@ -85,9 +115,11 @@ faulty = mine_of_a_test:Faulty
 [femoreg_torch.optimisers]
 grid = mine_of_a_test:Grid
 gone = mine_of_a_test:Gone
+lost = mine_of_a_test:Lost
 function = mine_of_a_test:not_settings
 [femoreg_torch.steps]
 nothing = mine_of_a_test:Nothing
+bad = mine_of_a_test:Bad
 """
 PRESET = """
 steps:
@@ -219,6 +251,45 @@ def test_faults_of_a_similarity_are_told_by_its_name(  # type: ignore[no-untyped
         return
     with pytest.raises(InputError, match=rf"similarity faulty \(mine_of_a_test:Faulty\): {says}"):
         run_plan(scene[0], plan, None, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("raises", r"raised KeyError: 'boom' \(mine_of_a_test.py, line \d+\)"),
+        ("none", "a Result was expected, got NoneType"),
+        ("short", r"a finite delta of shape \(2,\) was expected"),
+        ("nan", r"a finite delta of shape \(2,\) was expected"),
+    ],
+)
+def test_faults_of_an_optimiser_are_told_by_its_name(  # type: ignore[no-untyped-def]
+    installed: Path, scene, how: str, says: str
+) -> None:
+    text = PRESET.replace("{kind: grid, steps: 9}", f"{{kind: lost, how: {how}}}")
+    (installed / "mine.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=rf"optimiser lost \(mine_of_a_test:Lost\): {says}"):
+        run_plan(scene[0], load_plan(installed / "mine.yaml"), None, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("raises", r"step bad \(mine_of_a_test:Bad\): raised KeyError: 'boom' \(mine_of_a_test.py, line \d+\)"),
+        ("yields nothing", r"bad \(mine_of_a_test:Bad\) gave no record"),
+        ("scales", "the pose of the ball: not a rigid transform"),
+    ],
+)
+def test_faults_of_a_step_are_told_by_its_name(installed: Path, scene, how: str, says: str) -> None:  # type: ignore[no-untyped-def]
+    text = PRESET.replace("{name: idle, kind: nothing}", f"{{name: odd, kind: bad, how: {how}}}")
+    (installed / "mine.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=rf"mine.yaml, step “odd”: {says}"):
+        run_plan(scene[0], load_plan(installed / "mine.yaml"), None, seed=0)
+
+
+def test_a_kind_of_images_that_no_case_has_is_told(installed: Path, scene) -> None:  # type: ignore[no-untyped-def]
+    (installed / "mine.yaml").write_text(PRESET.replace("[plain]", "[plane]"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"no images of a kind “plane”; there are: “plain”, and \[all\]"):
+        run_plan(scene[0], load_plan(installed / "mine.yaml"), None, seed=0)
 
 
 def test_a_similarity_with_derivatives_of_its_own_is_checked_too() -> None:

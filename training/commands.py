@@ -85,6 +85,7 @@ def measure(
     """
     from rich.console import Console
 
+    from femoreg_torch.commands.telling import in_place_of
     from femoreg_torch.detect import load_network
     from femoreg_torch.errors import InputError
     from femoreg_torch.files import check_new_folder, new_folder
@@ -97,6 +98,7 @@ def measure(
     if register and len(register) != len(images):
         raise InputError(f"--register: {len(register)} folders for {len(images)} files of images; one each is needed.")
     check_new_folder(out)
+    before = in_place_of(out)
     network = load_network(weights)
     readings: list[Reading] = []
     for number, path in enumerate(images):
@@ -109,6 +111,7 @@ def measure(
     with new_folder(out) as built:
         page = write_accuracy(built, readings, counted)
     Console().print(page, highlight=False)
+    Console().print(f"Measured, and written to {out}{before}", markup=False, highlight=False, soft_wrap=True)
 
 
 def train_segmentation(

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
 from rich.console import Console
@@ -45,6 +46,12 @@ def tell_device(console: Console, name: DeviceName) -> torch.device:
         reason = why_no_gpu()
         console.print(f"Computing on {told(device)}" + (f": {reason}." if reason else "."), markup=False)
     return device
+
+
+def in_place_of(out: Path) -> str:
+    """What a command says after where it wrote, if something stood there before; to be asked before it writes."""
+    stood = out.is_file() or (out.is_dir() and any(out.iterdir()))
+    return ", in place of what stood there" if stood else ""
 
 
 def tell(console: Console, what: str, words: str) -> None:

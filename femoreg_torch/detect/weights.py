@@ -34,7 +34,7 @@ class LandmarkNetwork:
         return next((weight.device for weight in self.module.parameters()), CPU)
 
 
-def load_network(path: Path | None = None, device: torch.device = CPU) -> LandmarkNetwork:
+def load_network(path: str | Path | None = None, device: torch.device = CPU) -> LandmarkNetwork:
     """The network of a weights file, without a path the shipped one, on a device.
 
     Raises `InputError` for a file that is missing or holds something else, a kind of network or an anatomy that is not
@@ -43,6 +43,7 @@ def load_network(path: Path | None = None, device: torch.device = CPU) -> Landma
     from models.kinds import NETWORKS
     from models.weights import SHIPPED_WEIGHTS, read_weights
 
+    path = None if path is None else Path(path)
     where = str(path or SHIPPED_WEIGHTS)
     if path is not None:
         check_readable(path, "Give a weights file (safetensors) that `femoreg train` wrote.")

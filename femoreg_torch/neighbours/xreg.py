@@ -22,8 +22,9 @@ from torch import Tensor
 
 from femoreg_torch.arrays import MOST_PIXELS, check_pixels
 from femoreg_torch.errors import InputError
-from femoreg_torch.files import temporary_file
+from femoreg_torch.files import check_suffix, temporary_file
 from femoreg_torch.geometry import invert_rigid, read_itk_transform
+from femoreg_torch.geometry.rigid import check_rigid
 from femoreg_torch.hdf5 import Hdf5File, open_hdf5
 from femoreg_torch.neighbours.frames import XregCamera
 
@@ -87,7 +88,12 @@ def read_transform(path: Path) -> Tensor:
 
 
 def write_transform(path: Path, matrix: Tensor) -> None:
-    """Write a rigid matrix (4, 4) as an ITK affine transform, `.h5` or `.tfm`, as it takes points. Raises `OSError`."""
+    """Write a rigid matrix (4, 4) as an ITK affine transform, `.h5`, `.tfm` or `.txt`, as it takes points.
+
+    Raises `InputError` for another name and for what is not rigid, and `OSError` where it cannot be written.
+    """
+    check_suffix(Path(path), (".h5", ".tfm", ".txt"))
+    matrix = check_rigid(matrix.double().cpu(), f"the transform for {path}")
     transform = sitk.AffineTransform(3)
     transform.SetMatrix(matrix[:3, :3].double().flatten().tolist())
     transform.SetTranslation(matrix[:3, 3].double().tolist())

@@ -11,8 +11,9 @@ import torch
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
+from femoreg_torch.extensions import Group, guarded, is_built_in, name_of
 from femoreg_torch.geometry import Poses
-from femoreg_torch.optimize import Optimiser
+from femoreg_torch.optimize import Optimiser, Result, SmoothObjective
 from femoreg_torch.registration.costs import ImageCosts, image_costs
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, Intrinsics, doubted, refined
@@ -76,6 +77,8 @@ class BodyPlan:
             raise InputError("rotation_deg and translation_mm need three numbers, one per camera axis.")
         if not self.move:
             raise InputError("a body: `move` names nothing.")
+        if not any((*self.rotation_deg, *self.translation_mm)):
+            raise InputError("a body: rotation_deg and translation_mm are all zero, so it does not move. Leave it out.")
         check_within(self, rotation_deg=(0, 180), translation_mm=(0, 5000))
 
     @property
@@ -239,7 +242,7 @@ def _optimised(
     moving = tuple(body.only(free) if isinstance(body, Intrinsics) else body for body in moving)
     bodies = tuple(body for body in moving if isinstance(body, Body) or len(body.free))
     objective = stage_objective(_costs(scene, poses, stage, views, bodies), bodies, stage.prior)
-    result = stage.optimiser.minimise(objective, sum(len(body.free) for body in bodies), seed)
+    result = _minimised(stage.optimiser, objective, sum(len(body.free) for body in bodies), seed)
     rigid = [body for body in bodies if isinstance(body, Body)]
     turned = len(rigid) < len(bodies) or any(body.view for body in rigid)
     return StageRecord(
@@ -254,6 +257,20 @@ def _optimised(
         moments_of(result, lambda delta: moved(poses, bodies, delta)),
         tuple(poses.camera1_from) if turned else tuple(name for body in rigid for name in body.objects),
     )
+
+
+def _minimised(optimiser: Optimiser, objective: SmoothObjective, unknowns: int, seed: int) -> Result:
+    """What an optimiser finds. Raises `InputError` that names one of another package if what it gives is no result."""
+    group: Group = "femoreg_torch.optimisers"
+    result = guarded("optimiser", group, optimiser, lambda: optimiser.minimise(objective, unknowns, seed))
+    if is_built_in(optimiser):
+        return result
+    name = name_of(group, optimiser)
+    if not isinstance(result, Result):
+        raise InputError(f"optimiser {name}: a Result was expected, got {type(result).__name__}.")
+    if result.delta.shape != (unknowns,) or not torch.isfinite(result.delta).all():
+        raise InputError(f"optimiser {name}: a finite delta of shape ({unknowns},) was expected.")
+    return replace(result, delta=result.delta.double())
 
 
 def _costs(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], bodies: tuple[Moving, ...]) -> ImageCosts:

@@ -14,6 +14,7 @@ from femoreg_torch.registration.scene import Kind, Scene
 ALL = "all"  # objects that have a pose, or kinds of images that the case has
 ONE_VIEW = "this case has one view only"
 CARM_IS_KNOWN = "the C-arm's poses are given"
+_USUAL = "anatomy", "device"  # kinds of images that presets name, whether a case has them or not
 
 
 class Step(Protocol):
@@ -56,8 +57,14 @@ def lacking(kinds: Sequence[Kind], views: Collection[int], scene: Scene) -> str 
 def check_known(names: Iterable[str], kinds: Iterable[Kind], scene: Scene, poses: Poses) -> None:
     """Raise `InputError` that names the first object which the scene does not know.
 
-    Where the scene has no image of one of a step's `kinds`, its names may be of objects that only those would show.
+    Where the scene has no image of one of a step's `kinds`, its names may be of objects that only those would show. A
+    kind that no object of the scene is shown in, and no case of femur and device has, is a slip of the pen.
     """
+    known = {ALL, *_USUAL, *scene.images}.union(*(thing.shown_in for thing in scene.objects.values()))
+    for kind in kinds:
+        if kind not in known:
+            there = ", ".join(f"“{each}”" for each in scene.images)
+            raise InputError(f"this case has no images of a kind “{kind}”; there are: {there}, and [{ALL}].")
     if any(kind not in scene.images for kind in kinds):
         return
     for name in sorted(set(names) - {ALL} - set(scene.objects)):

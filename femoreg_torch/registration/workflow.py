@@ -8,10 +8,13 @@ from torch import Tensor
 
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.errors import InputError
+from femoreg_torch.extensions import Group, guarded, is_built_in, name_of
 from femoreg_torch.geometry import Poses
+from femoreg_torch.geometry.rigid import check_rigid
 from femoreg_torch.registration.materials.calibration import Calibration
 from femoreg_torch.registration.plan import Plan
 from femoreg_torch.registration.scene import Scene
+from femoreg_torch.registration.step import Step
 
 Report = Callable[[str, float], None]  # what is done, and the share of the plan behind it
 Follow = Callable[[Poses], None]  # where everything is after each optimisation of a step
@@ -59,7 +62,7 @@ def run_plan(
             notes += left
             records: Iterable[StageRecord] = [record]
         else:
-            records = step.run(scene, poses, seed * 1000 + number)
+            records = _records(plan, step, scene, poses, seed * 1000 + number)
         for record in records:
             trace.append(record)
             poses = record.poses
@@ -69,6 +72,25 @@ def run_plan(
         report("done", 1.0)
     skipped = (f"stage “{plan.steps[n].name}” was left out: {reason}" for n, reason in reasons.items() if reason)
     return Outcome(scene, poses, tuple(trace), (*skipped, *notes))
+
+
+def _records(plan: Plan, step: Step, scene: Scene, poses: Poses, seed: int) -> Iterable[StageRecord]:
+    """What a step does. Raises `InputError` that names one of another package which leaves nothing to go on from."""
+    if is_built_in(step):
+        return step.run(scene, poses, seed)
+    where = f"registration preset {plan.preset}, step “{step.name}”:"
+    group: Group = "femoreg_torch.steps"
+    records = guarded(f"{where} step", group, step, lambda: list(step.run(scene, poses, seed)))
+    if not records or not all(isinstance(record, StageRecord) for record in records):
+        raise InputError(
+            f"{where} {name_of(group, step)} gave no record, or something else. The last one holds the poses."
+        )
+    for record in records:
+        for view, camera in enumerate(record.poses.camera_from_camera1, 1):
+            check_rigid(camera, f"{where} the pose of the C-arm in view {view}")
+        for name, pose in record.poses.camera1_from.items():
+            check_rigid(pose, f"{where} the pose of the {name}")
+    return records
 
 
 def _is_placed_beside(scene: Scene, name: str) -> bool:

@@ -10,7 +10,7 @@ from torch import Tensor
 from femoreg_torch.derivatives import first_order
 from femoreg_torch.settings import check_within
 from femoreg_torch.similarity import cpu, cuda
-from femoreg_torch.similarity.checks import check_patches, check_size, check_weights, check_whole
+from femoreg_torch.similarity.checks import check_image, check_patches, check_size, check_weights, check_whole
 from femoreg_torch.similarity.curvature import patch_curvature
 from femoreg_torch.similarity.kernels import (
     FLAT,
@@ -51,6 +51,7 @@ class GradNcc:
 
     def inside(self, field: Tensor | None, fixed: Tensor, weights: Tensor | None = None) -> "FixedGradNcc":
         """As `against`, by the patches whose derivatives need no pixel outside `field`, see `FieldSimilarity`."""
+        check_image(fixed)
         radius = self.patch_radius
         check_patches(fixed, radius)
         check_weights(fixed, weights)

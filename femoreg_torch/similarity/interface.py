@@ -35,7 +35,7 @@ class FieldSimilarity(Similarity, Protocol):
     """One that can keep away from pixels altogether."""
 
     def inside(self, field: Tensor | None, fixed: Tensor, weights: Tensor | None) -> FixedSimilarity:
-        """As `against`, but nothing outside `field` (H, W), bool, of either image changes any cost.
+        """As `against`, but no number outside `field` (H, W), bool, of either image changes any cost; nan may.
 
         Raises `InputError` if that leaves nothing to compare.
         """

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from femoreg_torch.settings import check_within
-from femoreg_torch.similarity.checks import check_patches, check_size, check_weights, check_whole
+from femoreg_torch.similarity.checks import check_image, check_patches, check_size, check_weights, check_whole
 from femoreg_torch.similarity.kernels import FLAT, patch_sums, patch_weights
 
 
@@ -34,6 +34,7 @@ class Ncc:
 
     def inside(self, field: Tensor | None, fixed: Tensor, weights: Tensor | None = None) -> "FixedNcc | FixedPatchNcc":
         """As `against`, by the pixels of `field`, or by the patches wholly within it, see `FieldSimilarity`."""
+        check_image(fixed)
         if field is not None and self.patch_radius is None:
             weights = field.to(fixed) if weights is None else weights * field
         check_weights(fixed, weights)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from femoreg_torch.errors import InputError
 from femoreg_torch.settings import check_within
-from femoreg_torch.similarity.checks import check_size, check_weights
+from femoreg_torch.similarity.checks import check_image, check_size, check_weights
 from femoreg_torch.similarity.kernels import away_from, derivative_taps, image_gradients
 
 
@@ -33,6 +33,7 @@ class GradientOrientation:
 
     def inside(self, field: Tensor | None, fixed: Tensor, weights: Tensor | None = None) -> "FixedGradientOrientation":
         """As `against`, by the pixels whose derivatives need none outside `field`, see `FieldSimilarity`."""
+        check_image(fixed)
         check_weights(fixed, weights)
         taps = derivative_taps(self.smoothing_px, fixed.device)
         maps = image_gradients(fixed[None], taps)[0]

@@ -4,11 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-import torch
 from torch import Tensor
 
-from femoreg_torch.errors import InputError, defect_in_one_line
-from femoreg_torch.extensions import name_of
+from femoreg_torch.errors import InputError
+from femoreg_torch.extensions import guarded, is_built_in, name_of
 from femoreg_torch.similarity.interface import FieldSimilarity, FixedSimilarity, Similarity, SmoothFixedSimilarity
 
 _T = TypeVar("_T")
@@ -37,34 +36,20 @@ def similarity_name(similarity: Any) -> str:
     """How messages call a similarity or its settings: by the class, of other packages with their kind and module."""
     if isinstance(similarity, WatchedSimilarity):
         return similarity_name(similarity.settings)
-    return type(similarity).__name__ if _is_built_in(similarity) else name_of("femoreg_torch.similarities", similarity)
+    return type(similarity).__name__ if is_built_in(similarity) else name_of("femoreg_torch.similarities", similarity)
 
 
 def watched(prepared: FixedSimilarity, settings: Any) -> FixedSimilarity:
     """A prepared similarity that tells its faults by the name of its settings; one of this package as it is."""
-    if isinstance(prepared, WatchedSimilarity) or _is_built_in(prepared):
+    if isinstance(prepared, WatchedSimilarity) or is_built_in(prepared):
         return prepared
     kind = WatchedSmoothSimilarity if isinstance(prepared, SmoothFixedSimilarity) else WatchedSimilarity
     return kind(prepared, settings)
 
 
 def told(settings: Any, work: Callable[[], _T]) -> _T:
-    """What `work` gives. Raises `InputError` that names a similarity of another package for whatever goes wrong in it.
-
-    Only what is out of memory stays what it is.
-    """
-    if _is_built_in(settings):
-        return work()
-    try:
-        return work()
-    except (InputError, MemoryError, torch.cuda.OutOfMemoryError):
-        raise
-    except Exception as error:  # the code of others raises whatever it runs into
-        raise InputError(f"similarity {similarity_name(settings)}: raised {defect_in_one_line(error)}.") from error
-
-
-def _is_built_in(similarity: Any) -> bool:
-    return type(similarity).__module__.startswith("femoreg_torch.")
+    """What `work` gives; see `guarded`."""
+    return guarded("similarity", "femoreg_torch.similarities", settings, work)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,13 +42,13 @@ def everything(rows: pd.DataFrame, column: str) -> np.ndarray:
 def object_is_wrong(rows: pd.DataFrame, name: str) -> pd.Series:
     """Of every run: whether an object is off by more than 4 mm or 2°, or is not placed though it should be.
 
-    Of the two, what no run tells was not measured, and is not asked.
+    Where runs tell only one of the two, the other was not measured, and is not asked.
     """
+    limits = {f"{name}_mm": WRONG_MM, f"{name}_deg": WRONG_DEG}
+    measured = [column for column in limits if told(rows, column).notna().any()]
     wrong = pd.Series(False, rows.index)
-    for column, limit in ((f"{name}_mm", WRONG_MM), (f"{name}_deg", WRONG_DEG)):
-        errors = told(rows, column)
-        if errors.notna().any():
-            wrong |= asked(rows, column) & ~(errors <= limit)
+    for column in measured or limits:
+        wrong |= asked(rows, column) & ~(told(rows, column) <= limits[column])
     return wrong
 
 

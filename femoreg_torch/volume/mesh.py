@@ -4,6 +4,7 @@ Closedness and orientation are trimesh's. Its voxels, however, are either inside
 the fraction of each that is inside, or thin walls come out by up to half a voxel too thick or thin.
 """
 
+import math
 from typing import TYPE_CHECKING
 
 import numba
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 
 from femoreg_torch.arrays import check_voxels
-from femoreg_torch.errors import InputError
+from femoreg_torch.errors import InputError, shortened
 from femoreg_torch.volume.attenuation import hu_to_attenuation
 from femoreg_torch.volume.grid import Volume, axis_aligned
 
@@ -156,8 +157,12 @@ def voxelise_mesh(mesh: "trimesh.Trimesh", spacing_mm: float, hu: float) -> Volu
     Each voxel is weighted by the fraction of it that lies inside (exact along z, 4 × 4 sub-samples across), so that
     edges are anti-aliased and the volume is kept. `lps_from_index` maps indices to the mesh's CAD mm. HU count from air
     (−1000).
-    Raises `InputError` for an open mesh.
+    Raises `InputError` for an open mesh, a spacing that is not positive, and HU of less than nothing.
     """
+    if not 0 < spacing_mm < math.inf:
+        raise InputError(f"voxelise_mesh: spacing_mm must be positive and finite, got {shortened(spacing_mm)}.")
+    if not -1000 <= hu < math.inf:
+        raise InputError(f"voxelise_mesh: hu must be finite and at least -1000 (air), got {shortened(hu)}.")
     mesh = check_closed(mesh, "device")
     grid = empty_grid(mesh.bounds, spacing_mm)
     return grid.with_data(hu_to_attenuation(torch.tensor(float(hu)), -1000.0) * mesh_share(mesh, grid))

@@ -77,7 +77,7 @@ def _lps_from_index(image: sitk.Image) -> Tensor:
     return torch.from_numpy(affine)
 
 
-def read_volume(path: Path) -> Volume:
+def read_volume(path: str | Path) -> Volume:
     """Any volume as float32 (Z, Y, X) on its own grid, index axes closest to +L, +P, +S, exact affine (also oblique).
 
     `path` is a NIfTI, NRRD or MHA file, the folder of one DICOM series, or one of its files. Raises `InputError` for
@@ -86,13 +86,14 @@ def read_volume(path: Path) -> Volume:
     return read_volume_told(path)[0]
 
 
-def read_volume_told(path: Path, series: str | None = None) -> tuple[Volume, tuple[str, ...]]:
+def read_volume_told(path: str | Path, series: str | None = None) -> tuple[Volume, tuple[str, ...]]:
     """As `read_volume`, and what had to be done to it in words.
 
     `series` names one of several DICOM series: its number, its UID or a part of its description. Raises `InputError` as
     `read_volume` does.
     """
-    image, told = _read(Path(path), series)
+    path = Path(path)
+    image, told = _read(path, series)
     image = _oriented(image, path)
     stored = sitk.GetArrayViewFromImage(image)
     data = torch.from_numpy(stored.astype(np.float32))
@@ -101,12 +102,12 @@ def read_volume_told(path: Path, series: str | None = None) -> tuple[Volume, tup
     return Volume(data, _lps_from_index(image)), told
 
 
-def read_ct(path: Path) -> Volume:
+def read_ct(path: str | Path) -> Volume:
     """A CT in HU, as `read_volume` reads it. Raises `InputError` for what that refuses and for what is not in HU."""
     return read_ct_told(path)[0]
 
 
-def read_ct_told(path: Path, series: str | None = None) -> tuple[Volume, tuple[str, ...]]:
+def read_ct_told(path: str | Path, series: str | None = None) -> tuple[Volume, tuple[str, ...]]:
     """As `read_ct`, and what had to be done to it in words; `series` as for `read_volume_told`. Raises `InputError`."""
     volume, told = read_volume_told(path, series)
     lowest, highest = (v.item() for v in volume.data.aminmax())

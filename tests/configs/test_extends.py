@@ -36,7 +36,7 @@ def test_named_entries_are_changed_added_moved_and_removed() -> None:
 
 @pytest.mark.parametrize("change", [{"name": "x", "before": "none"}, {"name": "none", "remove": True}])
 def test_a_name_that_is_not_there_is_told(change: dict[str, object]) -> None:
-    with pytest.raises(InputError, match=r"f, steps: there is no entry named 'none'; there are: one, two"):
+    with pytest.raises(InputError, match=r"f, steps: there is no entry named 'none'; there are: “one”, “two”"):
         laid_over(BASE, {"steps": [change]}, "f")
 
 
@@ -70,3 +70,13 @@ def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message) as raised:
         load_preset("carm", tmp_path / "mine.yaml")
     assert "\n" not in str(raised.value)
+
+
+def test_a_misspelt_name_of_an_entry_with_a_kind_is_told() -> None:
+    base = {"steps": [{"name": "orbit search, coarse", "kind": "orbit_search"}]}
+    with pytest.raises(
+        InputError, match=r"no entry named 'orbit serch' to change, and a new one needs `kind`; .*“orbit"
+    ):
+        laid_over(base, {"steps": [{"name": "orbit serch", "step_deg": 1}]}, "f")
+    added = laid_over(base, {"steps": [{"name": "new", "kind": "stage"}]}, "f")
+    assert [step["name"] for step in added["steps"]] == ["orbit search, coarse", "new"]

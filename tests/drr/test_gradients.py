@@ -125,6 +125,25 @@ def test_jacobian_image_agrees_with_the_gradient():
     assert relative_error(expected / SCALE, twist.grad / SCALE) < 2e-5
 
 
+@pytest.mark.parametrize("loss", [lambda image: image.sum(), lambda image: image.square().sum()])
+def test_an_image_cannot_be_differentiated_twice_by_a_pose_and_says_so(loss) -> None:
+    volumes, poses, _, _ = scene()
+
+    def of(twist: Tensor) -> Tensor:
+        return loss(project(volumes[0], exp_se3(twist[None]) @ poses[:1, 0], CAMERA))
+
+    with pytest.raises(RuntimeError, match="an image of `project` cannot be differentiated twice"):
+        torch.autograd.functional.hessian(of, torch.zeros(6, dtype=torch.float64))
+
+
+def test_a_linear_loss_is_linear_in_the_volume_and_no_error():
+    volumes, poses, weights, _ = scene()
+    data = volumes[0].data.clone().requires_grad_()
+    image = project(Volume(data, volumes[0].lps_from_index), poses[:, 0], CAMERA)
+    (slope,) = torch.autograd.grad((image * weights).sum(), data, create_graph=True)
+    assert not slope.requires_grad
+
+
 def test_volume_gradient_agrees_with_autograd_through_the_march():
     volumes, poses, weights, _ = scene()
     gradients = []

@@ -159,6 +159,18 @@ def test_itk_transforms_come_back(tmp_path: Path, name: str) -> None:
         write_transform(tmp_path / "none" / name, pose)
 
 
+def test_a_transform_of_another_name_or_kind_is_refused(tmp_path: Path) -> None:
+    pose = torch.eye(4, dtype=torch.float64)
+    for name, matrix, says in (
+        ("pose.foo", pose, "a name that ends in .h5 or .tfm or .txt was expected"),
+        ("pose.tfm", 2 * pose, "not a rigid transform"),
+        ("pose.tfm", pose[:3], "a 4×4 matrix was expected"),
+    ):
+        with pytest.raises(InputError, match=says):
+            write_transform(tmp_path / name, matrix)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_transform_that_a_full_disk_cuts_off_is_told(tmp_path: Path) -> None:
     """As text; where HDF5 cannot close a file, ITK says so, and the process cannot end in order any more."""
     path, pose = tmp_path / "pose.tfm", torch.from_numpy(lps_from_world())

@@ -8,7 +8,7 @@ from pictures import picture
 from torch import Tensor
 
 from femoreg_torch.errors import InputError
-from femoreg_torch.similarity import GradNcc
+from femoreg_torch.similarity import GradientOrientation, GradNcc, Ncc
 from femoreg_torch.similarity.kernels import derivative_taps, image_gradients, patch_sums
 
 
@@ -118,7 +118,12 @@ def test_weights_choose_where_images_are_compared() -> None:
 
 @pytest.mark.parametrize(
     ("weights", "radius", "says"),
-    [(torch.zeros(40, 33), 3, "all pixel weights are zero"), (None, 20, "no patch of radius 20 fits")],
+    [
+        (torch.zeros(40, 33), 3, "all pixel weights are zero"),
+        (torch.full((40, 33), torch.nan), 3, "must be finite and not negative"),
+        (torch.ones(40, 33).index_fill(0, torch.tensor([3]), -1.0), 3, "must be finite and not negative"),
+        (None, 20, "no patch of radius 20 fits"),
+    ],
 )
 def test_nothing_to_compare_is_said(weights: Tensor | None, radius: int, says: str) -> None:
     with pytest.raises(InputError, match=says):
@@ -128,3 +133,24 @@ def test_nothing_to_compare_is_said(weights: Tensor | None, radius: int, says: s
 def test_an_image_of_another_size_is_refused() -> None:
     with pytest.raises(InputError, match="images are"):
         GradNcc(3).against(picture(15))(torch.zeros(1, 8, 8))
+
+
+@pytest.mark.parametrize("kind", [GradNcc(3), Ncc(), Ncc(3), GradientOrientation()])
+def test_whole_numbers_and_what_is_no_image_are_refused(kind: GradNcc | Ncc | GradientOrientation) -> None:
+    whole = (100 * picture(15)).int()
+    with pytest.raises(InputError, match=r"the fixed image holds torch.int32, floating-point numbers were expected"):
+        kind.against(whole)
+    with pytest.raises(InputError, match=r"images hold torch.int32"):
+        kind.against(picture(15))(whole[None])
+    with pytest.raises(InputError, match=r"shape \(H, W\) was expected, got \(1, 40, 33\)"):
+        kind.against(picture(15)[None])
+    with pytest.raises(InputError, match="must be a torch tensor, got ndarray"):
+        kind.against(picture(15).numpy())  # type: ignore[arg-type]
+
+
+def test_a_cost_cannot_be_differentiated_twice_and_says_so() -> None:
+    moving = picture(16)[None].requires_grad_()
+    cost = GradNcc(3).against(picture(15))(moving).sum()
+    (slope,) = torch.autograd.grad(cost, moving, create_graph=True)
+    with pytest.raises(RuntimeError, match="a cost of GradNcc cannot be differentiated twice"):
+        slope.sum().backward()

@@ -75,6 +75,14 @@ def test_an_object_that_the_images_show_and_no_run_finds_is_wrong() -> None:
     assert run_is_wrong(rows).all()
 
 
+def test_what_was_not_measured_makes_no_run_wrong() -> None:
+    """Of runs of others, say, whose table has errors in mm alone."""
+    rows = made_up(3, scale=0.1).drop(columns=["pelvis_deg", "femur_deg", "device_deg"])
+    assert not run_is_wrong(rows).any()
+    rows.loc[1, "pelvis_mm"] = 4.1
+    assert run_is_wrong(rows).tolist() == [False, True, False]
+
+
 def test_where_no_run_gives_a_result_all_is_wrong() -> None:
     rows = refuse(made_up(3), [0, 1, 2])
     assert (right_runs(rows).met, right_runs(rows).of) == (0, 3)

@@ -48,6 +48,25 @@ def _alone(scene: Scene, drift: MotionBetween) -> float:
     return gain_alone(scene, true_poses(), drift, PLAIN)
 
 
+def test_a_device_is_not_moved_along_the_beam_of_its_view() -> None:
+    """Nearer to the source it would look larger and darker, which an unknown material asks for."""
+    truth = true_poses()
+    scene = make_scene(truth)
+    for view in range(3):
+        found = truth.camera_from("device")[view]
+        beam = found[:3, 3] / found[:3, 3].norm()
+        across = torch.linalg.cross(beam, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+        gains = []
+        for way in (beam, across / across.norm()):
+            moved = found.clone()
+            moved[:3, 3] += 8 * way if way is beam else 3 * way
+            back = torch.linalg.inv(truth.camera_from_camera1[view]) @ moved
+            drift = MotionBetween("device", (view,), ("device",), torch.zeros(6), torch.zeros(6), 0.0)
+            gains.append(gain_alone(scene, truth.with_object("device", back), drift, PLAIN))
+        assert gains[0] < 0.5 * gains[1], view
+        assert gains[1] > 0.1
+
+
 def _motions(scene: Scene) -> tuple[tuple[MotionBetween, ...], tuple[str, ...]]:
     covariance = pose_covariance(scene, true_poses(), _LEVEL, GradNcc(1))
     return covariance.motions, doubts_about_motion(covariance, LIMITS, _never, tuple)

@@ -136,7 +136,7 @@ def test_stretched_patients_are_refused(patient, settings):
         render_views(patient, replace(settings, views=replace(settings.views, size=0.1)), 1, 0, "")
 
 
-def test_the_command_writes_what_measure_reads(scan, tmp_path):
+def test_the_command_writes_what_measure_reads(scan, tmp_path, capsys):
     write_volume(tmp_path / "ct.nii.gz", scan[0])
     write_volume(tmp_path / "labels.nii.gz", scan[1])
     write_landmarks(tmp_path / "landmarks.json", landmarks())
@@ -144,8 +144,13 @@ def test_the_command_writes_what_measure_reads(scan, tmp_path):
     (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")
     config, out = str(tmp_path / "mine.yaml"), tmp_path / "one.safetensors"
     labelled_images(tmp_path, out=out, count=2, config=config, name="boxes")
+    assert "in place of" not in capsys.readouterr().out
     back = read_labelled(out)
     assert back.images.shape == (2, 96, 96)
     assert back.source == "boxes"
     with pytest.raises(InputError, match="count of 1"):
         labelled_images(tmp_path, out=out, count=0, config=config)
+    with pytest.raises(InputError, match=r"one.h5: a name that ends in .safetensors was expected"):
+        labelled_images(tmp_path, out=tmp_path / "one.h5", count=1, config=config)
+    labelled_images(tmp_path, out=out, count=1, config=config)
+    assert ", in place of what stood there" in " ".join(capsys.readouterr().out.split())
