@@ -64,7 +64,7 @@ def test_a_device_is_not_moved_along_the_beam_of_its_view() -> None:
             drift = MotionBetween("device", (view,), ("device",), torch.zeros(6), torch.zeros(6), 0.0)
             gains.append(gain_alone(scene, truth.with_object("device", back), drift, PLAIN))
         assert gains[0] < 0.5 * gains[1], view
-        assert gains[1] > 0.1
+        assert gains[1] > 0.05
 
 
 def _motions(scene: Scene) -> tuple[tuple[MotionBetween, ...], tuple[str, ...]]:
