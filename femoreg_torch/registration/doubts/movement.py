@@ -18,6 +18,9 @@ _MOST_MOTION_MM, _MOST_MOTION_DEG, _SURE_OF_MOTION, _SURE_IN_ALL = 0.3, 0.3, 3.0
 # itself saves of the image's cost. Where it moved by 1.2 mm and 0.8° between the views, in six of six at least 0.012;
 # where its handle sagged by 3° in one view of another simulator, 0.007. Of 16 right ones of three simulators at most
 # 0.002, though the step of one had promised as much as of a moved device; of a right one before saturated air 0.003.
+# Fitted without moving along the beam, as now: of five that had slid, turned or moved 0.0117 to 0.026, of the handle
+# that sagged 0.0053; of two right ones of one more simulator 0.0042 and 0.0047, where 3 and 9 mm along the beam had
+# saved 0.016 each.
 _WORTH_FITTING = 0.0009
 _SHARE_OF_DRIFT = 0.005
 # Of a tool along and about its guide in one view alone. Of 39 right ones of three simulators slides were at most 0.3 mm
