@@ -34,7 +34,7 @@ def doubts_about_bends(case: Case, scene: Scene, poses: Poses, imaging: Imaging)
 
 
 _ADVICE = {
-    "rim": "is the distortion of an image intensifier left in them (a pincushion, or a barrel where they are drawn in)? "
+    "rim": "is the pincushion of an image intensifier left in them, or a barrel where they are drawn in? "
     "Give each view a picture of its grid (`grid` of the views)",
     "twist": "is the S-distortion of an image intensifier left in them? Give each view a picture of its grid (`grid` "
     "of the views)",
