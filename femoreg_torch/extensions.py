@@ -9,7 +9,7 @@ The class is a frozen dataclass of settings; the other keys beside `kind` are it
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import entry_points
 from types import FunctionType
 from typing import Any, Literal, TypeVar
@@ -102,6 +102,13 @@ def read_kind(group: Group, builtin: Mapping[str, Any], content: Any, where: str
             "that this one extends, null in place of its value takes it away."
         )
     return read_record(record, rest, where)
+
+
+def check_has(thing: Any, group: Group, methods: Sequence[str], where: str) -> None:
+    """Raises `InputError` that starts with `where` for an object of another package that lacks a method of its kind."""
+    lacking = [method for method in methods if not callable(getattr(thing, method, None))]
+    if lacking and not is_built_in(thing):
+        raise InputError(f"{where}: {name_of(group, thing)} has no method `{lacking[0]}`, which this kind needs.")
 
 
 def record_of(found: Any, where: str) -> Any:

@@ -110,9 +110,11 @@ not_settings = max
 """
 ENTRY_POINTS = """
 [femoreg_torch.similarities]
+grid = mine_of_a_test:Grid
 squared_differences = mine_of_a_test:SquaredDifferences
 faulty = mine_of_a_test:Faulty
 [femoreg_torch.optimisers]
+squared_differences = mine_of_a_test:SquaredDifferences
 grid = mine_of_a_test:Grid
 gone = mine_of_a_test:Gone
 lost = mine_of_a_test:Lost
@@ -215,6 +217,8 @@ def test_a_preset_names_what_another_package_registers(installed: Path, scene: t
             "unknown key 'step'. Known keys: steps. .* null in place of its value",
         ),
         ("gain: 4", "gain: much", "gain"),
+        ("kind: squared_differences, gain: 4", "kind: grid, steps: 4", r"has no method `against`, which this kind"),
+        ("kind: grid, steps: 9", "kind: squared_differences", r"has no method `minimise`, which this kind needs"),
     ],
 )
 def test_mistakes_are_told(installed: Path, old: str, new: str, says: str) -> None:

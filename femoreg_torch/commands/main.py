@@ -218,7 +218,13 @@ def _summary(command: EntryPoint) -> str:
 
 
 def _run(command: EntryPoint, arguments: list[str]) -> int:
-    function = command.load()
+    try:
+        function = command.load()
+    except (ImportError, AttributeError) as error:
+        raise InputError(
+            f"the command {command.name}, {command.value}, cannot be imported ({error}). Mend or remove the package "
+            "that names it."
+        ) from error
     status = function(**_parse(function, command.name, arguments))
     return DONE if status is None else int(status)
 
@@ -237,6 +243,8 @@ def parser_of(function: Callable[..., Any], name: str) -> "ArgumentParser":
         parser.add_argument("--config", action="config", help="YAML file with options; the command line overrides it")
     annotated = get_type_hints(function, include_extras=True)
     for parameter in inspect.signature(function).parameters.values():
+        if parameter.name not in hints:
+            raise InputError(f"the command {name}: its parameter `{parameter.name}` needs a type.")
         flags, settings = _argument(parameter, hints[parameter.name])
         flags += getattr(annotated[parameter.name], "__metadata__", ())  # short forms, as in Annotated[int, "-n"]
         parser.add_argument(*flags, **settings, help=help_of.get(parameter.name))

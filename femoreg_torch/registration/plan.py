@@ -6,7 +6,7 @@ from typing import Any, get_type_hints
 
 from femoreg_torch.configs import load_preset
 from femoreg_torch.errors import InputError, shortened
-from femoreg_torch.extensions import find, pop_kind, record_of
+from femoreg_torch.extensions import check_has, find, pop_kind, record_of
 from femoreg_torch.optimize import Optimiser, read_optimiser
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.materials.calibration import Calibration
@@ -80,4 +80,5 @@ def _step(content: dict[str, Any], where: str) -> Step:
     readers = {name: _READERS[hint] for name, hint in get_type_hints(record).items() if hint in _READERS}
     ready = {name: read(rest.pop(name), f"{where}, {name}") for name, read in readers.items() if name in rest}
     step: Step = read_record(record, rest, where, ready)
+    check_has(step, "femoreg_torch.steps", ["left_out", "run"], where)
     return step

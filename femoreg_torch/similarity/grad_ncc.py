@@ -31,7 +31,8 @@ class GradNcc:
     """Patch Grad-NCC: both images are smoothed by a Gaussian of `smoothing_px` and differentiated by Sobel.
 
     NCC is taken over every patch of (2 · patch_radius + 1)² pixels that lies wholly inside, and averaged over patches,
-    weighted, and over both derivatives. A patch that is flat in either image has NCC 0. xReg:
+    weighted, and over both derivatives. A patch that is flat in either image has NCC 0: its squared deviations sum up
+    to less than 1e-10, for line integrals, which are of order 1. xReg:
     xregImgSimMetric2DPatchGradNCC (smoothing 1.1 px is its 5 × 5 kernel); Grupp et al., IEEE TBME 67 (2020) 441.
     """
 
