@@ -85,11 +85,34 @@ def train(config: Path) -> None:
     print(config)
 
 
+def untyped(run) -> None:  # type: ignore[no-untyped-def]
+    """A command whose parameter has no type."""
+
+
 @pytest.fixture(autouse=True)
 def commands(monkeypatch: pytest.MonkeyPatch) -> None:
     """The commands of this file in place of the installed ones, for this process."""
     points = [EntryPoint(name, f"{__name__}:{name}", module.GROUP) for name in ("measure", "fail", "read", "train")]
     monkeypatch.setattr(module, "entry_points", lambda group: points if group == module.GROUP else [])
+
+
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        (
+            "no_such_module:run",
+            "the command own, no_such_module:run, cannot be imported (No module named 'no_such_module')",
+        ),
+        (f"{__name__}:gone", f"the command own, {__name__}:gone, cannot be imported (module"),
+        (f"{__name__}:untyped", "the command own: its parameter `run` needs a type"),
+    ],
+)
+def test_faults_of_a_command_of_another_package_are_told_by_its_name(
+    value: str, says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "entry_points", lambda group: [EntryPoint("own", value, group)])
+    assert main(["own", "x"]) == 2
+    assert says in capsys.readouterr().err
 
 
 def test_arguments_reach_the_function(capsys: pytest.CaptureFixture[str]) -> None:
