@@ -17,7 +17,7 @@ from femoreg_torch.registration.doubts.device import (
     doubts_beside_devices,
 )
 from femoreg_torch.registration.doubts.images import doubts_about_smears, doubts_about_the_images
-from femoreg_torch.registration.doubts.movement import doubts_about_motion, explains_the_carm
+from femoreg_torch.registration.doubts.movement import anatomy_moved, doubts_about_motion, explains_the_carm
 from femoreg_torch.registration.doubts.plan import doubts_about_the_guide, doubts_about_the_plan
 from femoreg_torch.registration.doubts.shape import doubts_about_handedness, doubts_about_rigidity
 from femoreg_torch.registration.evidence.covariance import PoseCovariance
@@ -43,8 +43,25 @@ def doubts(
         return (*told.contradictions, *doubts_about_units(case, told, True), *strange, *plan)
     clear = scene.where_unsaturated()
     given = scene.camera_from_camera1 is not None
-    geometry: list[Callable[[], tuple[str, ...]]] = [
-        lambda: doubts_about_the_carm(
+    # The longest are asked first, so that no core waits long for another at the end.
+    asked: dict[str, Callable[[], tuple[str, ...]]] = {
+        "rigidity": lambda: doubts_about_rigidity(clear, poses, imaging),
+        "handedness": lambda: doubts_about_handedness(told, scene, poses, imaging),
+        "size": lambda: doubts_about_size(case, told, clear, poses, imaging),
+        "smears": lambda: doubts_about_smears(clear, poses),
+        "told tips": lambda: doubts_about_told_tips(case, told),
+        "models": lambda: doubts_about_the_models(told, scene, poses),
+        "guide": lambda: doubts_about_the_guide(case, poses),
+        "plan": lambda: doubts_about_the_plan(case, scene),
+        "motion": lambda: doubts_about_motion(
+            covariance,
+            limits,
+            lambda drift: gain_alone(scene, poses, drift, imaging),
+            lambda: finer_joint_turns(scene, poses, imaging),
+            given=given,
+        ),
+        "views": lambda: doubts_about_the_views(scene, poses),
+        "C-arm": lambda: doubts_about_the_carm(
             scene,
             poses,
             covariance,
@@ -52,30 +69,26 @@ def doubts(
             displays,
             lambda shift: gain_of_shifted_points(scene, poses, shift, imaging),
         ),
-        lambda: doubts_about_the_views(scene, poses),
-        lambda: doubts_about_motion(
-            covariance,
-            limits,
-            lambda drift: gain_alone(scene, poses, drift, imaging),
-            lambda: finer_joint_turns(scene, poses, imaging),
-            given=given,
+        "CT": lambda: (
+            doubts_about_the_ct(case, clear, poses, imaging) or doubts_about_bends(case, clear, poses, imaging)
         ),
-    ]
-    questions: list[Callable[[], tuple[str, ...]]] = [
-        # What is shown of such a CT, or in such pictures, seems to have moved or bent as well.
-        lambda: doubts_about_the_ct(case, clear, poses, imaging) or doubts_about_bends(case, clear, poses, imaging),
-        *(geometry[::-1] if explains_the_carm(covariance) else geometry),
-        lambda: doubts_about_the_plan(case, scene),
-        lambda: doubts_about_the_guide(case, poses),
-        lambda: doubts_about_the_models(told, scene, poses),
-        lambda: doubts_about_told_tips(case, told),
-        lambda: doubts_about_smears(clear, poses),  # what moved or was smeared seems to be of another size as well
-        lambda: doubts_about_size(case, told, clear, poses, imaging),
-        lambda: doubts_about_handedness(told, scene, poses, imaging),
-        lambda: doubts_about_rigidity(clear, poses, imaging),
-    ]
-    # The longest are asked first, so that no core waits long for another at the end.
-    answers = on_all_cores(lambda ask: ask(), questions[::-1], scene.device)[::-1]
-    found = tuple(chain(*answers))
+    }
+    answers = dict(zip(asked, on_all_cores(lambda ask: ask(), list(asked.values()), scene.device), strict=True))
+    found = tuple(chain.from_iterable(answers[name] for name in _likeliest_first(covariance)))
     found = (*doubts_about_units(case, told, bool(found)), *found)
     return (*told.contradictions, *found, *doubts_beside_devices(clear, poses, imaging, bool(found)))
+
+
+def _likeliest_first(covariance: PoseCovariance) -> tuple[str, ...]:
+    """The questions of `doubts`, those first whose answers are likely the cause of what others find.
+
+    Bones of a CT of another shape, or in bent pictures, seem to have moved or bent as well. Anatomy that moved between
+    the images seems bent, too. But where only one view seems to show something elsewhere, it is the model in nine of
+    ten cases of three other simulators that was bent, broken, or of another size; in the tenth the device had moved.
+    What was smeared seems to be of another size.
+    """
+    models = "smears", "size", "rigidity"
+    moved = ("motion", *models) if anatomy_moved(covariance) else (*models, "motion")
+    carm = "C-arm", "views"
+    geometry = (*moved, *carm[::-1]) if explains_the_carm(covariance) else (*carm, *moved)
+    return ("CT", *geometry, "plan", "guide", "models", "told tips", "handedness")

@@ -71,7 +71,7 @@ def doubts_about_motion(
     the depth of a bone in one view is so open that it may gain more where a device has moved.
     """
     moved = [each for each in covariance.drifts if _has_drifted(each, alone)]
-    if any(_has_moved(each) for each in covariance.motions):
+    if anatomy_moved(covariance):
         moved.append(max(covariance.motions, key=lambda each: each.gain))
     if not moved:
         return doubts_about_joints(covariance, finer) or doubts_about_guides(covariance, limits)
@@ -99,6 +99,11 @@ def doubts_about_motion(
         f"{deg:.1f}° from where the other images show them: {who} has moved between the images{or_given}; take them "
         "again",
     )
+
+
+def anatomy_moved(covariance: PoseCovariance) -> bool:
+    """Whether bones lie elsewhere in the images with the device than in those without it."""
+    return any(_has_moved(each) for each in covariance.motions)
 
 
 def explains_the_carm(covariance: PoseCovariance) -> bool:

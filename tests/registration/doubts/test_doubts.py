@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,8 +11,10 @@ from registration_scenes import CARM, float64, make_scene, true_poses
 from femoreg_torch.case import Case, CaseObject, PlannedPath
 from femoreg_torch.case.model import Model
 from femoreg_torch.geometry import Poses, about_point, exp_se3
+from femoreg_torch.registration.doubts.ask import _likeliest_first
 from femoreg_torch.registration.doubts.carm import doubts_about_the_views
 from femoreg_torch.registration.doubts.plan import doubts_about_the_guide, doubts_about_the_plan
+from femoreg_torch.registration.evidence.motion import MotionBetween
 from femoreg_torch.registration.orbit import rolled
 from femoreg_torch.registration.scene import Scene
 
@@ -98,3 +101,23 @@ def test_a_guide_that_points_out_of_the_bone_is_doubted(tip: float, base: float,
     assert len(doubts) == told
     assert all("`tip` and `base` exchanged" in doubt and "Is `side` the one" in doubt for doubt in doubts)
     assert doubts_about_the_guide(case, Poses(pose[None], {"pelvis": pose})) == ()
+
+
+def motion(gain: float, kind: str | None) -> MotionBetween:
+    """What a bone, or anatomy, would move by, surely."""
+    far, sure = torch.ones(6, dtype=torch.float64), torch.full((6,), 0.01, dtype=torch.float64)
+    return MotionBetween(kind, (1,), ("pelvis",), far, sure, gain)
+
+
+def test_the_likeliest_cause_is_told_first() -> None:
+    def order(motions: list[MotionBetween], drifts: list[MotionBetween]) -> tuple[str, ...]:
+        found = SimpleNamespace(motions=motions, drifts=drifts, joint_turns=[])
+        return _likeliest_first(found)  # type: ignore[arg-type]
+
+    still, moved, drifted = order([], []), order([motion(0.002, "device")], []), order([], [motion(0.02, None)])
+    assert len(set(still)) == len(still)
+    assert set(still) == set(moved) == set(drifted)
+    assert still[0] == "CT"
+    assert still.index("C-arm") < still.index("size") < still.index("rigidity") < still.index("motion")
+    assert moved.index("motion") < moved.index("size")
+    assert drifted.index("rigidity") < drifted.index("motion") < drifted.index("C-arm")
