@@ -43,9 +43,9 @@ def _told(scene: Scene, found: Misfit) -> str:
         )
     if found.found_deg is not None:
         return (
-            f"{what} does not fit where it was found {beside}, but {found.found_deg:.0f}° from view 1 it does, where "
-            "the preset does not look for it: take the preset fast, which does, or give the C-arm's poses "
-            "(`camera_from_camera1` of the views)"
+            f"{what} does not fit where it was found {beside}, but {found.found_deg:.0f}° from view 1 it does: the "
+            "search for it ended elsewhere, or does not go so far; take the preset fast, which looks as far as "
+            f"{ORBIT_DEG:.0f}°, or give the C-arm's poses (`camera_from_camera1` of the views)"
         )
     if scene.camera_from_camera1 is not None:
         return (

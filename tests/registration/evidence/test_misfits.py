@@ -108,7 +108,7 @@ def test_a_view_that_was_not_looked_for_so_far_is_told_with_its_angle(scene: Sce
     (found,) = misfits(scene, astray, PLAIN)
     assert found.found_deg == pytest.approx(15, abs=3)
     (doubt,) = doubts_about_the_images(scene, [found])
-    assert f"but {found.found_deg:.0f}° from view 1 it does, where the preset does not look for it" in doubt
+    assert f"but {found.found_deg:.0f}° from view 1 it does: the search for it ended elsewhere" in doubt
 
 
 def test_poses_that_the_case_gives_are_named_where_an_image_does_not_fit(scene: Scene) -> None:
