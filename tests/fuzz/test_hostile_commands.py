@@ -18,7 +18,7 @@ from femoreg_torch.commands.main import main
 from femoreg_torch.errors import InputError
 
 SEED = int(os.environ.get("FEMOREG_FUZZ_SEED", time.time_ns() % 2**31))
-COUNT = int(os.environ.get("FEMOREG_FUZZ_COUNT", 600)) // 10
+COUNT = int(os.environ.get("FEMOREG_FUZZ_COUNT", 400)) // 10
 _OPTIONS = (
     "--out", "--seed", "--preset", "--weights", "--landmarks", "--start", "--robot", "--config", "--jobs", "--count",
     "--spacing-mm", "--side", "--override", "--cases", "--intensity", "--carm", "--require-trust", "--nothing", "-n",

@@ -16,7 +16,7 @@ import pytest
 from fuzz_doors import doors
 
 SEED = int(os.environ.get("FEMOREG_FUZZ_SEED", time.time_ns() % 2**31))
-COUNT = int(os.environ.get("FEMOREG_FUZZ_COUNT", 600))
+COUNT = int(os.environ.get("FEMOREG_FUZZ_COUNT", 400))
 
 
 def test_valid_files_are_taken(tmp_path: Path) -> None:
