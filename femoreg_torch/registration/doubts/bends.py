@@ -62,10 +62,10 @@ def _told(bend: Bend) -> str:
     amounts = {view: each.value for view, each in zip(views, bend.amounts, strict=True)}
     if bend.way.name == "twist":
         return f"the pictures seem to be twisted at their rim, {_by(amounts)}"
-    told = []
-    if outward := {view: mm for view, mm in amounts.items() if mm > 0}:
+    told, least = [], bend.way.least_mm
+    if outward := {view: mm for view, mm in amounts.items() if mm > least}:
         told.append(f"stretched towards their rim, {_by(outward)}")
-    if inward := {view: -mm for view, mm in amounts.items() if mm <= 0}:
+    if inward := {view: -mm for view, mm in amounts.items() if mm < -least}:
         told.append(f"drawn in at their rim, {_by(inward)}")
     return f"the pictures seem to be {', and '.join(told)}"
 

@@ -114,10 +114,10 @@ RIM, TWIST, COLUMNS, ROWS = _ways((0, 2))
     ("bends", "says"),
     [
         ([], None),
-        ([Bend(RIM, (Amount(0.3, 0.1), Amount(6.0, 0.8)), 0.008)], "stretched towards their rim, by 0.3 mm in view 1"),
+        ([Bend(RIM, (Amount(0.3, 0.1), Amount(6.0, 0.8)), 0.008)], "stretched towards their rim, by 6.0 mm in view 3 ("),
         (
-            [Bend(RIM, (Amount(-3.2, 0.4), Amount(0.3, 0.8)), 0.1)],
-            "stretched towards their rim, by 0.3 mm in view 3, and drawn in at their rim, by 3.2 mm in view 1 (",
+            [Bend(RIM, (Amount(-3.2, 0.4), Amount(4.3, 0.8)), 0.1)],
+            "stretched towards their rim, by 4.3 mm in view 3, and drawn in at their rim, by 3.2 mm in view 1 (",
         ),
         ([Bend(RIM, (Amount(-4.2, 1.8), Amount(0.3, 1.9)), 0.017)], None),  # not sure
         ([Bend(RIM, (Amount(-2.6, 0.7), Amount(-4.2, 1.9)), -0.06)], None),  # explains nothing
