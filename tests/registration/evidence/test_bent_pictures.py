@@ -114,7 +114,7 @@ RIM, TWIST, COLUMNS, ROWS = _ways((0, 2))
     ("bends", "says"),
     [
         ([], None),
-        ([Bend(RIM, (Amount(0.3, 0.1), Amount(6.0, 0.8)), 0.008)], "stretched towards their rim, by 6.0 mm in view 3 ("),
+        ([Bend(RIM, (Amount(0.3, 0.1), Amount(6.0, 0.8)), 0.008)], "towards their rim, by 6.0 mm in view 3 ("),
         (
             [Bend(RIM, (Amount(-3.2, 0.4), Amount(4.3, 0.8)), 0.1)],
             "stretched towards their rim, by 4.3 mm in view 3, and drawn in at their rim, by 3.2 mm in view 1 (",
