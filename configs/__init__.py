@@ -94,7 +94,8 @@ def _merged(base: list[dict[str, Any]], changes: list[dict[str, Any]], where: st
         for name in [other for _, other in beside] + ([entry["name"]] if remove else []):
             if name not in names:
                 raise InputError(f"{where}: there is no entry named {shortened(name)}; there are: {_listed(names)}.")
-        if entry["name"] not in names and "kind" not in entry and all("kind" in other for other in entries):
+        of_kinds = bool(entries) and all("kind" in other for other in entries)
+        if entry["name"] not in names and "kind" not in entry and of_kinds:
             raise InputError(
                 f"{where}: there is no entry named {shortened(entry['name'])} to change, and a new one needs `kind`; "
                 f"there are: {_listed(names)}."

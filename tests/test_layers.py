@@ -25,8 +25,8 @@ MAY_IMPORT = {
 # anatomy, geometry and volumes only, and `registration` takes a `Case`. `evaluation` compares a result with the case's
 # truth, so it comes late.
 ROOMS = (
-    "errors", "paths", "yaml_faults", "text", "arrays", "tensors", "hdf5_entries", "hdf5", "cores", "memory",
-    "exchange", "pictures", "delimited", "files", "extras", "configs", "settings", "extensions",
+    "errors", "paths", "yaml_faults", "text", "arrays", "tensors", "derivatives", "hdf5_entries", "hdf5", "cores",
+    "memory", "exchange", "pictures", "delimited", "files", "extras", "configs", "settings", "extensions",
     "anatomy", "geometry", "volume", "segment", "drr", "fluoro", "case",
     "detect", "pnp", "similarity", "optimize", "registration", "navigation", "neighbours", "planning",
     "evaluation", "review", "beads", "intake", "statistics", "commands", "__main__",

@@ -78,5 +78,8 @@ def test_a_misspelt_name_of_an_entry_with_a_kind_is_told() -> None:
         InputError, match=r"no entry named 'orbit serch' to change, and a new one needs `kind`; .*“orbit"
     ):
         laid_over(base, {"steps": [{"name": "orbit serch", "step_deg": 1}]}, "f")
+    assert laid_over(
+        {"vary": [{"name": "one"}]}, {"vary": [{"name": "one", "remove": True}, {"name": "two"}]}, "f"
+    ) == {"vary": [{"name": "two"}]}  # of none that is left, no kind is asked
     added = laid_over(base, {"steps": [{"name": "new", "kind": "stage"}]}, "f")
     assert [step["name"] for step in added["steps"]] == ["orbit search, coarse", "new"]
