@@ -76,6 +76,10 @@ class Lost:
             return {}["boom"]
         if self.how == "none":
             return None
+        if self.how == "words":
+            return Result(delta, 0.0, "done", 1)
+        if self.how == "list":
+            return Result(delta.tolist(), 0.0, Stop.BUDGET, 1)
         return Result(delta[:1] if self.how == "short" else delta * float("nan"), 0.0, Stop.BUDGET, 1)
 
 
@@ -85,7 +89,7 @@ class Bad:
     how: str
 
     def left_out(self, scene, poses):
-        return None
+        return {}["left"] if self.how == "cannot say" else None
 
     def run(self, scene, poses, seed):
         if self.how == "raises":
@@ -262,6 +266,8 @@ def test_faults_of_a_similarity_are_told_by_its_name(  # type: ignore[no-untyped
     [
         ("raises", r"raised KeyError: 'boom' \(mine_of_a_test.py, line \d+\)"),
         ("none", "a Result was expected, got NoneType"),
+        ("words", "a Stop was expected to say why it ended, got str"),
+        ("list", r"a finite delta of shape \(2,\) was expected"),
         ("short", r"a finite delta of shape \(2,\) was expected"),
         ("nan", r"a finite delta of shape \(2,\) was expected"),
     ],
@@ -279,6 +285,7 @@ def test_faults_of_an_optimiser_are_told_by_its_name(  # type: ignore[no-untyped
     ("how", "says"),
     [
         ("raises", r"step bad \(mine_of_a_test:Bad\): raised KeyError: 'boom' \(mine_of_a_test.py, line \d+\)"),
+        ("cannot say", r"step bad \(mine_of_a_test:Bad\): raised KeyError: 'left' \(mine_of_a_test.py, line \d+\)"),
         ("yields nothing", r"bad \(mine_of_a_test:Bad\) gave no record"),
         ("scales", "the pose of the ball: not a rigid transform"),
     ],

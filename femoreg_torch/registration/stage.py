@@ -7,13 +7,14 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
+from torch import Tensor
 
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.errors import InputError
 from femoreg_torch.extensions import Group, guarded, is_built_in, name_of
 from femoreg_torch.geometry import Poses
-from femoreg_torch.optimize import Optimiser, Result, SmoothObjective
+from femoreg_torch.optimize import Optimiser, Result, SmoothObjective, Stop
 from femoreg_torch.registration.costs import ImageCosts, image_costs
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.intrinsics import DISTANCE, POINTS, Intrinsics, doubted, refined
@@ -268,9 +269,14 @@ def _minimised(optimiser: Optimiser, objective: SmoothObjective, unknowns: int, 
     name = name_of(group, optimiser)
     if not isinstance(result, Result):
         raise InputError(f"optimiser {name}: a Result was expected, got {type(result).__name__}.")
-    if result.delta.shape != (unknowns,) or not torch.isfinite(result.delta).all():
+    if not isinstance(result.stop, Stop):
+        raise InputError(
+            f"optimiser {name}: a Stop was expected to say why it ended, got {type(result.stop).__name__}."
+        )
+    delta = result.delta
+    if not isinstance(delta, Tensor) or delta.shape != (unknowns,) or not torch.isfinite(delta).all():
         raise InputError(f"optimiser {name}: a finite delta of shape ({unknowns},) was expected.")
-    return replace(result, delta=result.delta.double())
+    return replace(result, delta=delta.double())
 
 
 def _costs(scene: Scene, poses: Poses, stage: Stage, views: tuple[int, ...], bodies: tuple[Moving, ...]) -> ImageCosts:

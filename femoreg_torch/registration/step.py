@@ -6,6 +6,7 @@ from typing import Protocol
 
 from torch import Tensor
 
+from femoreg_torch.case.femoroplasty import ANATOMY_IMAGES, DEVICE_IMAGES
 from femoreg_torch.case.trace import StageRecord
 from femoreg_torch.errors import InputError
 from femoreg_torch.geometry import Poses
@@ -14,7 +15,6 @@ from femoreg_torch.registration.scene import Kind, Scene
 ALL = "all"  # objects that have a pose, or kinds of images that the case has
 ONE_VIEW = "this case has one view only"
 CARM_IS_KNOWN = "the C-arm's poses are given"
-_USUAL = "anatomy", "device"  # kinds of images that presets name, whether a case has them or not
 
 
 class Step(Protocol):
@@ -60,7 +60,9 @@ def check_known(names: Iterable[str], kinds: Iterable[Kind], scene: Scene, poses
     Where the scene has no image of one of a step's `kinds`, its names may be of objects that only those would show. A
     kind that no object of the scene is shown in, and no case of femur and device has, is a slip of the pen.
     """
-    known = {ALL, *_USUAL, *scene.images}.union(*(thing.shown_in for thing in scene.objects.values()))
+    known = {ALL, ANATOMY_IMAGES, DEVICE_IMAGES, *scene.images}.union(
+        *(thing.shown_in for thing in scene.objects.values())
+    )
     for kind in kinds:
         if kind not in known:
             there = ", ".join(f"“{each}”" for each in scene.images)

@@ -112,6 +112,6 @@ def _placed_anew(scene: Scene, poses: Poses, waiting: Mapping[str, Tensor]) -> d
 def _left_out(plan: Plan, number: int, scene: Scene, poses: Poses) -> str | None:
     step = plan.steps[number]
     try:
-        return step.left_out(scene, poses)
+        return guarded("step", "femoreg_torch.steps", step, lambda: step.left_out(scene, poses))
     except InputError as error:
         raise InputError(f"registration preset {plan.preset}, step “{step.name}”: {error}") from error

@@ -109,8 +109,9 @@ def _change(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> _Ch
 def change_about(scene: Scene, poses: Poses, name: str, kind: Kind, view: int) -> Tensor:
     """How much darker (H, W) the image with a device is than the one without it about its shadow, negative if brighter.
 
-    Of the logarithm of intensity. Darker is what nearly all of the image is by its exposure, and not what came beside
-    the device; brighter is what is smoothed over some centimetres, and continued into the shadow.
+    Of the logarithm of intensity. An exposure counts that makes nearly the whole image darker, not what came beside the
+    device. Where the image is brighter about the device, that is smoothed over some centimetres, and continued into the
+    shadow.
     """
     image, seen = scene.image(kind, view), _change(scene, poses, name, kind, view)
     if not seen.elsewhere.any():

@@ -80,7 +80,7 @@ def _from_another_view(
 def with_view_first(scene: Scene, view: int) -> Scene:
     """The images of the first kind alone, those of a view (from 0) first, and then of the others in their order.
 
-    What starts where camera 1 has it is shown by none of them, as nobody knows where that is from the other view.
+    They show nothing of what starts where camera 1 has it, as nobody knows where that is from the other view.
     """
     order = [view, *(other for other in range(scene.views) if other != view)]
     kind = scene.first_kind
@@ -91,7 +91,9 @@ def with_view_first(scene: Scene, view: int) -> Scene:
     return replace(
         scene,
         objects={
-            name: thing if _starts_with_landmarks(scene, name) else replace(thing, shown_in=())
+            name: thing
+            if _starts_with_landmarks(scene, name)
+            else replace(thing, shown_in=tuple(other for other in thing.shown_in if other != kind))
             for name, thing in scene.objects.items()
         },
         images=ordered(scene.images),

@@ -102,10 +102,10 @@ def _cost(case: Case, told: Scene, plan: Plan, find: Detector, display: Display,
         camera_from_camera1=None if told.camera_from_camera1 is None else told.camera_from_camera1[:1],
         left_on_left=(0,) if display.left_on_left else (),
     )
-    seen = look_at(alone, 0, find)
-    if plan.needs_segmentations:
-        alone = with_segmentations(alone, seen, find)
     try:
+        seen = look_at(alone, 0, find)
+        if plan.needs_segmentations:
+            alone = with_segmentations(alone, seen, find)
         start = find_start(
             case.landmarks,
             seen,

@@ -140,6 +140,9 @@ def test_what_starts_in_camera_1_is_not_drawn_from_another_view(scene: Scene) ->
     tip = replace(everywhere["device"], start=CaseStart(beside="device"))
     there = with_view_first(replace(scene, objects=everywhere | {"tip": tip}), 1)
     assert set(there.start(TRUTH.camera1_from["pelvis"]).camera1_from) == {"pelvis", "femur"}
+    tool = replace(everywhere["device"], shown_in=("anatomy", "tool"))
+    there = with_view_first(replace(scene, objects=everywhere | {"device": tool}), 1)
+    assert there.objects["device"].shown_in == ("tool",)  # a kind that a step may name, though no image of it is left
 
 
 def test_images_masks_and_sides_are_put_in_the_order_of_the_views(scene: Scene) -> None:
