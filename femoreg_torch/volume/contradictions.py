@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
+import numba
 import numpy as np
 import torch
 from scipy import fft
@@ -224,8 +225,7 @@ def shifted_labels(ct: Volume, labels: Volume) -> Tensor | None:
     """
     size = torch.tensor(labels.data.shape)
     reach = (_QUICK_REACH_MM / torch.tensor(labels.spacing_mm).flip(0)).long()
-    where = labels.data.nonzero()
-    where = where[:: 1 + len(where) // _MOST_PLACES]
+    where = _some_places(labels)
     where = where[((where >= reach) & (where < size - reach)).all(1)]
     if not len(where):
         return None
@@ -256,21 +256,17 @@ def turned_labels(ct: Volume, labels: Volume) -> str | None:
 
     The mean of the CT in the labels is looked for about turns of all axes of up to 12°, together with shifts.
     """
-    where = labels.data.nonzero().flip(1)
+    where = _some_places(labels).flip(1).double()
     if not len(where):
         return None
-    where = where[:: 1 + len(where) // _MOST_PLACES].double()
     directions, middle = ct.lps_from_index[:3, :3], where.mean(0)
     arms, to_index = (where - middle) @ directions.T, torch.linalg.inv(directions)
-    values, size = ct.data.reshape(-1), torch.tensor(ct.data.shape)
-    last, strides = (size - 1).flip(0).double(), torch.tensor([1, int(size[2]), int(size[1] * size[2])])
+    values, places = ct.data.numpy(), arms.numpy()
 
     def mean(motion: Tensor) -> float:
         """By a turn about the middle of the labels, degrees along LPS, and a shift, mm (6,)."""
         turn = to_index @ exp_so3(torch.deg2rad(motion[:3]))
-        moved = torch.addmm(middle + to_index @ motion[3:], arms, turn.T)
-        places = (moved.round_().clamp_min_(0).minimum(last).long() * strides).sum(1)
-        return float(values[places].float().clamp(*_TOLD_HU).mean())
+        return _mean_at(values, places, turn.numpy(), (middle + to_index @ motion[3:]).numpy(), *_TOLD_HU)
 
     units = torch.eye(6, dtype=torch.float64)
     best = torch.zeros(6, dtype=torch.float64)
@@ -290,6 +286,28 @@ def turned_labels(ct: Volume, labels: Volume) -> str | None:
         f"from {_AXES[int(turn.abs().argmax())]}: does it belong to this CT, and do both headers tell the same "
         "directions of rows, columns and slices?"
     )
+
+
+def _some_places(labels: Volume) -> Tensor:
+    """Indices (N, 3) along z, y and x of every so manieth voxel that a label map names."""
+    named = np.flatnonzero(labels.data.numpy())
+    some = named[:: 1 + len(named) // _MOST_PLACES]
+    return torch.from_numpy(np.stack(np.unravel_index(some, tuple(labels.data.shape)), 1))
+
+
+@numba.njit(cache=True, nogil=True)
+def _mean_at(
+    values: np.ndarray, arms: np.ndarray, turn: np.ndarray, middle: np.ndarray, least: float, most: float
+) -> float:  # pragma: no cover (compiled)
+    """Of the voxels next to `turn` (3, 3) times `arms` (N, 3) plus `middle` (3,), indices along x, y and z."""
+    size, total = values.shape[::-1], 0.0
+    index = np.zeros(3, np.int64)
+    for x, y, z in arms:
+        for n in range(3):
+            place = np.rint(middle[n] + turn[n, 0] * x + turn[n, 1] * y + turn[n, 2] * z)
+            index[n] = min(max(int(place), 0), size[n] - 1)
+        total += min(max(float(values[index[2], index[1], index[0]]), least), most)
+    return total / len(arms)
 
 
 def _steps(volume: Volume, apart_mm: float) -> tuple[slice, slice, slice]:
