@@ -5,6 +5,7 @@ from femoreg_torch.fluoro.defects import without_defects
 from femoreg_torch.fluoro.dicom import Frames, carm_settings, read_header
 from femoreg_torch.fluoro.display import SOURCES, TURNS, Display, Source, nearest_source
 from femoreg_torch.fluoro.distortion import Distortion, GridImage, find_distortion, find_grid_spots
+from femoreg_torch.fluoro.exchanged import kinds_exchanged, rough_attenuation, shows_less, views_exchanged
 from femoreg_torch.fluoro.field import Circle, Polygon, blank_lines
 from femoreg_torch.fluoro.intensity import (
     attenuation_image,
@@ -58,6 +59,7 @@ __all__ = [
     "find_grid_spots",
     "find_shutter",
     "intensity_of",
+    "kinds_exchanged",
     "may_be_image",
     "natural",
     "nearest_side",
@@ -67,10 +69,13 @@ __all__ = [
     "read_header",
     "read_image",
     "read_stored",
+    "rough_attenuation",
     "saturated",
     "settled_intensity",
     "shades",
+    "shows_less",
     "told_together",
+    "views_exchanged",
     "without_defects",
     "without_penumbra",
     "write_image",

@@ -35,16 +35,18 @@ from femoreg_torch.fluoro import (
     check_intensity,
     check_matches,
     find_distortion,
+    kinds_exchanged,
     other_patient,
     raised,
     read_image,
     read_stored,
+    rough_attenuation,
     settled_intensity,
     told_together,
+    views_exchanged,
 )
 from femoreg_torch.fluoro.reading import LOOKS_LOG
 from femoreg_torch.geometry import Camera, CArm
-from femoreg_torch.intake.exchanged import kinds_exchanged, rough_attenuation, views_exchanged
 from femoreg_torch.intake.found import Found
 from femoreg_torch.volume import Patient
 

@@ -16,7 +16,11 @@ from femoreg_torch.registration.doubts.device import (
     doubts_about_units,
     doubts_beside_devices,
 )
-from femoreg_torch.registration.doubts.images import doubts_about_smears, doubts_about_the_images
+from femoreg_torch.registration.doubts.images import (
+    doubts_about_exchanged_kinds,
+    doubts_about_smears,
+    doubts_about_the_images,
+)
 from femoreg_torch.registration.doubts.movement import anatomy_moved, doubts_about_motion, explains_the_carm
 from femoreg_torch.registration.doubts.plan import doubts_about_the_guide, doubts_about_the_plan
 from femoreg_torch.registration.doubts.shape import doubts_about_handedness, doubts_about_rigidity
@@ -38,9 +42,10 @@ def doubts(
     not fit at all, nothing else that the images would say is asked.
     """
     displays = [case.display_of(view) for view in range(len(case.views))]
+    contradictions = *told.contradictions, *doubts_about_exchanged_kinds(told)
     if strange := doubts_about_the_images(scene, misfits(scene, poses, imaging)):
         plan = *doubts_about_the_plan(case, scene), *doubts_about_the_guide(case, poses)
-        return (*told.contradictions, *doubts_about_units(case, told, True), *strange, *plan)
+        return (*contradictions, *doubts_about_units(case, told, True), *strange, *plan)
     clear = scene.where_unsaturated()
     given = scene.camera_from_camera1 is not None
     # The longest are asked first, so that no core waits long for another at the end.
@@ -76,7 +81,7 @@ def doubts(
     answers = dict(zip(asked, on_all_cores(lambda ask: ask(), list(asked.values()), scene.device), strict=True))
     found = tuple(chain.from_iterable(answers[name] for name in _likeliest_first(covariance)))
     found = (*doubts_about_units(case, told, bool(found)), *found)
-    return (*told.contradictions, *found, *doubts_beside_devices(clear, poses, imaging, bool(found)))
+    return (*contradictions, *found, *doubts_beside_devices(clear, poses, imaging, bool(found)))
 
 
 def _likeliest_first(covariance: PoseCovariance) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+from femoreg_torch.fluoro import rough_attenuation, shows_less
 from femoreg_torch.geometry import Poses
 from femoreg_torch.registration.doubts.carm import ORBIT_DEG
 from femoreg_torch.registration.evidence.misfits import Misfit
@@ -59,6 +60,27 @@ def _told(scene: Scene, found: Misfit) -> str:
         "the same patient, and that little covers it; a C-arm that stood elsewhere needs its poses "
         f"(`camera_from_camera1` of the views){without}"
     )
+
+
+def doubts_about_exchanged_kinds(scene: Scene) -> tuple[str, ...]:
+    """Views whose image without the device shows something dense that the one with it lacks, in words."""
+    first, objects = scene.first_kind, list(scene.objects)
+    told = []
+    for kind in scene.images:
+        if kind == first or not set(scene.shown(objects, first)) < set(scene.shown(objects, kind)):
+            continue
+        exchanged = [
+            str(view + 1)
+            for _, view in scene.there([kind], range(scene.views))
+            if scene.there([first], [view])
+            and shows_less(*(rough_attenuation(scene.image(of, view), "log") for of in (first, kind)))
+        ]
+        if exchanged:
+            told.append(
+                f"the {first} image of view {' and '.join(exchanged)} shows something dense that the {kind} image "
+                "lacks, not the other way round: are the two exchanged? Check `views` of the case"
+            )
+    return tuple(told)
 
 
 def doubts_about_smears(scene: Scene, poses: Poses) -> tuple[str, ...]:

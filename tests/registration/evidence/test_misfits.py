@@ -8,7 +8,7 @@ import torch
 from registration_scenes import CARM, float64, make_scene, true_poses
 
 from femoreg_torch.geometry import exp_se3
-from femoreg_torch.registration.doubts.images import doubts_about_the_images
+from femoreg_torch.registration.doubts.images import doubts_about_exchanged_kinds, doubts_about_the_images
 from femoreg_torch.registration.evidence.misfits import misfits
 from femoreg_torch.registration.imaging import PLAIN
 from femoreg_torch.registration.scene import Kind, Scene
@@ -127,3 +127,13 @@ def test_the_only_device_image_may_be_of_something_else() -> None:
     (found,) = misfits(strange, truth, PLAIN)
     assert (found.kind, found.view, found.as_view, found.as_stored) == ("device", 0, None, None)
     assert "no images are exchanged" in doubts_about_the_images(strange, [found])[0]
+
+
+def test_images_with_and_without_the_device_that_are_exchanged_are_told_with_the_view(scene: Scene) -> None:
+    assert doubts_about_exchanged_kinds(scene) == ()
+    without, with_it = scene.image("anatomy", 1), scene.image("device", 1)
+    exchanged = with_image(with_image(scene, "anatomy", 1, with_it + 0.3), "device", 1, without)
+    (doubt,) = doubts_about_exchanged_kinds(exchanged)
+    assert doubt.startswith("the anatomy image of view 2 shows something dense that the device image lacks")
+    everywhere = replace(scene, images={"anatomy": scene.images["device"], "device": scene.images["anatomy"]})
+    assert "of view 1 and 2 and 3" in doubts_about_exchanged_kinds(everywhere)[0]
