@@ -41,6 +41,7 @@ class TipLength:
     longer_mm: float  # than its model
     gain: float  # of the mean patch Grad-NCC near the tip, by a model of that length
     cost: float  # 1 − that similarity
+    least_gain: float  # in any view
 
 
 def tip_length(
@@ -86,15 +87,17 @@ def tip_length(
     lengths = range(-_LONGEST_MM, _LONGEST_MM + 1)
     drawn = costs[0].objects[names[1]].volume
 
-    def cost(mm: float) -> float:
+    def of_each(mm: float) -> list[float]:
         stretched = replace(end, volume=_stretched(drawn, tip, axis, mm))
-        return sum(float(of.with_object(names[1], stretched)(of.still[None])) for of in costs) / len(costs)
+        return [float(of.with_object(names[1], stretched)(of.still[None])) for of in costs]
 
-    found = on_all_cores(cost, lengths, scene.device)
+    by_view = on_all_cores(of_each, lengths, scene.device)
+    found = [sum(each) / len(costs) for each in by_view]
     best = min(max(min(range(len(found)), key=lambda n: found[n]), 1), len(found) - 2)
     aside = parabola_minimum(*found[best - 1 : best + 2])
     between = 0.0 if math.isnan(aside) else min(max(aside, -1.0), 1.0)
-    return TipLength(lengths[best] + between, found[_LONGEST_MM] - min(found), min(found))
+    gains = [as_is - then for as_is, then in zip(by_view[_LONGEST_MM], by_view[found.index(min(found))], strict=True)]
+    return TipLength(lengths[best] + between, found[_LONGEST_MM] - min(found), min(found), min(gains))
 
 
 def _near_the_tip(

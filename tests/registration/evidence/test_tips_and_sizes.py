@@ -14,6 +14,7 @@ from femoreg_torch.case import Case, CaseObject, Model, Start
 from femoreg_torch.drr import project
 from femoreg_torch.geometry import Camera, CArm, centred_camera, project_points, transform_points
 from femoreg_torch.registration.doubts.device import (
+    _ends_elsewhere,
     _is_borne_out,
     _is_off,
     doubts_about_size,
@@ -326,17 +327,36 @@ def test_an_end_is_drawn_out_by_so_much_and_all_else_stays(mm: int) -> None:
     assert float(drawn_out.data[min(z)].sum()) == pytest.approx(float(end.data[min(z)].sum()), abs=1e-5)
 
 
+def length(longer_mm: float, gain: float, cost: float) -> TipLength:
+    """As all views show it alike."""
+    return TipLength(longer_mm, gain, cost, gain)
+
+
 @pytest.mark.parametrize(
     ("estimated", "as_told", "counts"),
     [
-        (TipLength(2.31, 0.31, 0.063), TipLength(2.42, 0.31, 0.070), True),  # 2.5 mm longer than its model
-        (TipLength(1.96, 0.084, 0.270), TipLength(2.04, 0.113, 0.119), True),  # the same, its end estimated badly
-        (TipLength(0.89, 0.012, 0.350), TipLength(-0.05, 0.0, 0.149), False),  # right, its end estimated badly
-        (TipLength(-1.45, 0.060, 0.241), TipLength(0.65, 0.005, 0.197), False),  # right, on equalised images
-        (TipLength(1.2, 0.03, 0.1), TipLength(0.1, 0.0, 0.2), True),  # a model as told that fits badly knows nothing
+        (length(2.31, 0.31, 0.063), length(2.42, 0.31, 0.070), True),  # 2.5 mm longer than its model
+        (length(1.96, 0.084, 0.270), length(2.04, 0.113, 0.119), True),  # the same, its end estimated badly
+        (length(0.89, 0.012, 0.350), length(-0.05, 0.0, 0.149), False),  # right, its end estimated badly
+        (length(-1.45, 0.060, 0.241), length(0.65, 0.005, 0.197), False),  # right, on equalised images
+        (length(1.2, 0.03, 0.1), length(0.1, 0.0, 0.2), True),  # a model as told that fits badly knows nothing
     ],
 )
 def test_an_estimated_end_counts_unless_the_model_as_told_fits_better_without(
     estimated: TipLength, as_told: TipLength, counts: bool
 ) -> None:
     assert _is_borne_out(estimated, as_told) is counts
+
+
+@pytest.mark.parametrize(
+    ("found", "elsewhere"),
+    [
+        (TipLength(2.08, 0.125, 0.072, 0.101), True),  # a wire that slid by 2 mm
+        (TipLength(1.08, 0.017, 0.303, -0.016), False),  # right: one of three noisy views shows it so much shorter
+        (TipLength(0.81, 0.016, 0.066, 0.009), False),  # right, by a little
+        (TipLength(1.08, 0.077, 0.018, 0.049), True),
+        (TipLength(-2.6, 0.153, 0.098, 0.139), True),
+    ],
+)
+def test_a_length_counts_that_explains_enough_and_that_no_view_contradicts(found: TipLength, elsewhere: bool) -> None:
+    assert _ends_elsewhere(found) is elsewhere
