@@ -168,7 +168,7 @@ def register_scene(
             outcome.trace,
             {name: each.displacement and each.displacement[0] for name, each in quality.items()},
         ),
-        *doubts(case, told, scene, outcome.poses, covariance, plan.imaging, Limits()),
+        *doubts(case, told, scene, outcome.poses, quality, covariance, plan.imaging, Limits()),
     )
     done = time.perf_counter()
     points, directions = path_in_camera1(case, outcome.poses)

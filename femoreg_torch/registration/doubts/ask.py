@@ -1,9 +1,9 @@
 """All that speaks against a result besides the quality of its objects, asked in one go."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import chain
 
-from femoreg_torch.case import Case
+from femoreg_torch.case import Case, ObjectQuality
 from femoreg_torch.cores import on_all_cores
 from femoreg_torch.geometry import Poses
 from femoreg_torch.registration.doubts.bends import doubts_about_bends
@@ -34,7 +34,14 @@ from femoreg_torch.registration.scene import Scene
 
 
 def doubts(
-    case: Case, told: Scene, scene: Scene, poses: Poses, covariance: PoseCovariance, imaging: Imaging, limits: Limits
+    case: Case,
+    told: Scene,
+    scene: Scene,
+    poses: Poses,
+    quality: Mapping[str, ObjectQuality],
+    covariance: PoseCovariance,
+    imaging: Imaging,
+    limits: Limits,
 ) -> tuple[str, ...]:
     """All that speaks against a result besides the quality of its objects, in words.
 
@@ -61,6 +68,7 @@ def doubts(
         "motion": lambda: doubts_about_motion(
             covariance,
             limits,
+            {name: each.in_plane_uncertainty_mm for name, each in quality.items()},
             lambda drift: gain_alone(scene, poses, drift, imaging),
             lambda: finer_joint_turns(scene, poses, imaging),
             given=given,

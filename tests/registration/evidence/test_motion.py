@@ -69,7 +69,7 @@ def test_a_device_is_not_moved_along_the_beam_of_its_view() -> None:
 
 def _motions(scene: Scene) -> tuple[tuple[MotionBetween, ...], tuple[str, ...]]:
     covariance = pose_covariance(scene, true_poses(), _LEVEL, GradNcc(1))
-    return covariance.motions, doubts_about_motion(covariance, LIMITS, _never, tuple)
+    return covariance.motions, doubts_about_motion(covariance, LIMITS, {}, _never, tuple)
 
 
 def test_no_motion_is_told_where_nothing_moved() -> None:
@@ -109,7 +109,7 @@ def test_one_kind_of_images_tells_nothing_of_motion() -> None:
     objects = {name: scene.objects[name] for name in ("pelvis", "femur")}
     covariance = pose_covariance(replace(scene, objects=objects), alone, _LEVEL, GradNcc(1))
     assert covariance.motions == ()
-    assert doubts_about_motion(covariance, LIMITS, _never, tuple) == ()
+    assert doubts_about_motion(covariance, LIMITS, {}, _never, tuple) == ()
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_all_views_together_need_less_certainty(views: tuple[int, ...], sigmas: 
     motion = torch.tensor([0.0, 0.0, 1.8, 0.0, 0.0, 0.4], dtype=torch.float64)
     found = MotionBetween("device", views, ("femur",), motion, motion.abs() / sigmas + 1e-9, gain)
     covariance = replace(pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(found,))
-    assert len(doubts_about_motion(covariance, LIMITS, _never, tuple)) == told
+    assert len(doubts_about_motion(covariance, LIMITS, {}, _never, tuple)) == told
 
 
 def test_a_device_that_moved_between_the_views_is_told() -> None:
@@ -139,7 +139,7 @@ def test_a_device_that_moved_between_the_views_is_told() -> None:
         covariance = pose_covariance(scene, truth, _LEVEL, GradNcc(1))
         of_device = [drift for drift in covariance.drifts if drift.objects == ("device",)]
         assert [drift.views for drift in of_device] == [(0,), (1,), (2,)]
-        said = doubts_about_motion(covariance, LIMITS, partial(_alone, scene), tuple)
+        said = doubts_about_motion(covariance, LIMITS, {}, partial(_alone, scene), tuple)
         assert len(said) == told, said
     assert "in the device image of view 2, the device lies elsewhere" in said[0]
     best = max(covariance.drifts, key=lambda drift: drift.gain)
@@ -157,7 +157,7 @@ def test_a_leg_that_turned_between_the_views_is_told() -> None:
         covariance = pose_covariance(scene, truth, _LEVEL, GradNcc(1))
         of_femur = [drift for drift in covariance.drifts if drift.objects == ("femur",)]
         assert [drift.views for drift in of_femur] == [(0,), (1,), (2,)]
-        said = doubts_about_motion(covariance, LIMITS, _never, tuple)
+        said = doubts_about_motion(covariance, LIMITS, {}, _never, tuple)
         assert len(said) == told, said
     assert "in view 3, the femur lies" in said[0]
     assert float(of_femur[2].motion[2]) == pytest.approx(3.0, abs=0.6)
@@ -190,7 +190,7 @@ def test_a_turn_in_a_joint_is_told_that_is_far_and_sure_and_explains_something(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)),
         motions=(), drifts=(), guide_drifts=(), joint_turns=(turn,),
     )  # fmt: skip
-    said = doubts_about_motion(covariance, LIMITS, _never, tuple)
+    said = doubts_about_motion(covariance, LIMITS, {}, _never, tuple)
     assert len(said) == told
     assert all("in view 3, the femur is turned by 1.3° in its joint" in one for one in said)
 
@@ -209,7 +209,7 @@ def test_a_small_turn_in_a_joint_is_asked_of_finer_pixels(coarse: JointTurn, fin
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)),
         motions=(), drifts=(), guide_drifts=(), joint_turns=(coarse,),
     )  # fmt: skip
-    said = doubts_about_motion(covariance, LIMITS, _never, lambda: (finer,))
+    said = doubts_about_motion(covariance, LIMITS, {}, _never, lambda: (finer,))
     assert len(said) == told
     assert all("in view 1, the femur is turned by 0.7° in its joint" in one for one in said)
 
@@ -221,26 +221,30 @@ def test_a_bone_must_gain_more_than_a_device_to_have_drifted(gain: float, told: 
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(), drifts=(drift,)
     )
-    assert len(doubts_about_motion(covariance, LIMITS, _never, tuple)) == told
+    assert len(doubts_about_motion(covariance, LIMITS, {}, _never, tuple)) == told
 
 
 @pytest.mark.parametrize(
-    ("step", "alone", "told"),
+    ("step", "apart", "alone", "told"),
     [
-        (0.0020, 0.002, 0),  # a right one, whose step promised much
-        (0.0010, 0.007, 1),  # a handle that sagged
-        (0.0011, 0.022, 1),  # of little cost, and much of that
-        (0.0014, 0.003, 0),  # a right one, half before saturated air
-        (0.0005, 0.007, 0),  # not worth a fit
+        (0.0020, 0.05, 0.002, 0),  # a right one, whose step promised much
+        (0.0010, 0.05, 0.007, 1),  # a handle that sagged
+        (0.0011, 0.05, 0.022, 1),  # of little cost, and much of that
+        (0.0014, 0.05, 0.003, 0),  # a right one, half before saturated air
+        (0.0005, 0.05, 0.007, 0),  # not worth a fit
+        (0.0048, 0.177, 0.0021, 1),  # moved by 1.5 mm, and its depth gave way
+        (0.0002, 0.160, 0.0031, 0),  # a right one that one view pulls
     ],
 )
-def test_a_drift_is_told_by_what_fitting_it_alone_gains(step: float, alone: float, told: int) -> None:
+def test_a_drift_is_told_by_what_fitting_it_alone_gains_or_where_the_views_disagree(
+    step: float, apart: float, alone: float, told: int
+) -> None:
     motion = torch.tensor([0.0, 0.0, 0.5, 0.9, 0.4, 0.0], dtype=torch.float64)
     drift = MotionBetween("device", (1,), ("device",), motion, motion.abs() / 3 + 1e-9, step)
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), motions=(), drifts=(drift,)
     )
-    assert len(doubts_about_motion(covariance, LIMITS, lambda _: alone, tuple)) == told
+    assert len(doubts_about_motion(covariance, LIMITS, {"device": apart}, lambda _: alone, tuple)) == told
 
 
 def _held(way: Tensor, view: int) -> Scene:
@@ -309,7 +313,7 @@ def test_what_is_far_sure_and_explains_something_is_told(
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), drifts=(), guide_drifts=(found,)
     )
-    told = doubts_about_motion(covariance, LIMITS, _never, tuple)
+    told = doubts_about_motion(covariance, LIMITS, {}, _never, tuple)
     assert len(told) == (words is not None)
     assert words is None or words in told[0]
 
@@ -322,7 +326,7 @@ def test_a_turn_in_one_view_is_not_told_where_the_images_leave_the_rotation_open
     covariance = replace(
         pose_covariance(make_scene(true_poses()), true_poses(), _LEVEL, GradNcc(1)), drifts=(), guide_drifts=(found,)
     )
-    assert len(doubts_about_motion(covariance, Limits(most_deviation_deg=most_deg), _never, tuple)) == told
+    assert len(doubts_about_motion(covariance, Limits(most_deviation_deg=most_deg), {}, _never, tuple)) == told
 
 
 @pytest.mark.parametrize(("gain", "told"), [(0.0025, False), (0.012, True)])
