@@ -30,7 +30,7 @@ from femoreg_torch.optimize import parabola_minimum
 from femoreg_torch.registration.costs import image_costs
 from femoreg_torch.registration.evidence.covariance import PoseCovariance, pose_covariance
 from femoreg_torch.registration.evidence.motion import JointTurn
-from femoreg_torch.registration.evidence.turns import TOLD, TurnLoss, losses_by_turning
+from femoreg_torch.registration.evidence.turns import TOLD, losses_by_turning
 from femoreg_torch.registration.imaging import PLAIN, Imaging
 from femoreg_torch.registration.level import Level
 from femoreg_torch.registration.roundness import Axis
@@ -63,9 +63,6 @@ class Limits:
     # 0.006 and more in 14 of two others, and were 0.2° off at most. Those that no image told lost 0.0004 at most, and
     # were up to 7° off; where one view showed a corner of a plastic handle alone, 0.0031, and the turn was 3.6° off.
     least_loss_by_turning: float = TOLD / 2
-    # Less suffices where two views agree. Of four right turns of four simulators, 0.8° off at most, the mean lost
-    # 0.0017 to 0.0030, and the view that lost second most 0.0011 to 0.0025; the corner was seen in one view alone.
-    least_loss_in_two_views: tuple[float, float] = (0.0015, 0.0008)  # the mean, and the second of them
     # A start of a stage is a rival of the best one if it ended with a cost so little above that, and so far from it by
     # the turn or the place; what is nearer, the following stages tell apart.
     rival_cost: float = 0.005
@@ -183,7 +180,7 @@ def _assess_object(
     covariance: PoseCovariance,
     limits: Limits,
     trace: Sequence[StageRecord],
-    lost_by_turning: tuple[TurnLoss, TurnLoss] | None,
+    lost_by_turning: tuple[float, float] | None,
 ) -> ObjectQuality:
     pulls = torch.tensor([view.pull_mm for view in views], dtype=torch.float64)
     uncertainty = float(pulls.square().mean().sqrt())
@@ -242,7 +239,7 @@ class _Judged:
         return cls(sigma[:3], sigma[3:], rest @ pull, beside)
 
 
-def _unturned(name: str, lost: tuple[TurnLoss, TurnLoss] | None, limits: Limits) -> str | None:
+def _unturned(name: str, lost: tuple[float, float] | None, limits: Limits) -> str | None:
     """`lost` is what the images lose by turning the object about its long axis, and its guide.
 
     None where that is not asked; nan counts as nothing.
@@ -250,18 +247,13 @@ def _unturned(name: str, lost: tuple[TurnLoss, TurnLoss] | None, limits: Limits)
     if lost is None:
         return None
     for loss, axis in zip(lost, ("long axis", "guide"), strict=True):
-        if not _tells(loss, limits):
-            nearly = f"nearly as well (similarity {loss.mean:.4f} lower)" if loss.mean >= _LOWER else "as well"
+        if not loss >= limits.least_loss_by_turning:
+            nearly = f"nearly as well (similarity {loss:.4f} lower)" if loss >= _LOWER else "as well"
             return (
                 f"no image tells the turn of the {name} about its {axis}: turned by 20 or 180°, what the images show "
                 f"of it fits {nearly}; let them show more of it"
             )
     return None
-
-
-def _tells(loss: TurnLoss, limits: Limits) -> bool:
-    mean, second = limits.least_loss_in_two_views
-    return loss.mean >= limits.least_loss_by_turning or (loss.mean >= mean and loss.second >= second)
 
 
 def _displacement(scene: Scene, poses: Poses, name: str) -> tuple[float, float] | None:

@@ -7,7 +7,6 @@ bit aside (0.066), where about the other everything fitted as well (0.0001), and
 """
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -26,16 +25,6 @@ Four simulated devices lost 0.16 to 0.21. A round guide whose handle no image sh
 are not quite round.
 """
 
-
-@dataclass(frozen=True)
-class TurnLoss:
-    """What the images lose of their similarity, by the turn that loses least."""
-
-    mean: float  # of all images that show the object; infinite where none does, nan where a similarity is
-    second: float  # of the image that loses second most; 0 where one image alone shows it
-
-
-UNASKED = TurnLoss(math.inf, math.inf)
 _TURNS_DEG = -20.0, 20.0, 180.0
 _FILLED = 0.004  # 1/mm: a fifth of water
 _MOST_POINTS = 20_000
@@ -43,30 +32,28 @@ _MOST_POINTS = 20_000
 
 def losses_by_turning(
     scene: Scene, poses: Poses, name: str, level: Level, similarity: Similarity, imaging: Imaging
-) -> tuple[TurnLoss, TurnLoss]:
-    """What the images lose at least if an object is turned about its long axis, and about its guide.
+) -> tuple[float, float]:
+    """What the images lose of their mean similarity, at least, if an object is turned about its long axis; its guide.
 
-    `UNASKED` where no image shows it, and about a guide that is not known.
+    Infinite where no image shows it, and about a guide that is not known. nan where a similarity is.
     """
     points = _points_in_view(scene, poses, name)
     if len(points) < 2:
-        return UNASKED, UNASKED
+        return math.inf, math.inf
     images, drawn = scene.there(scene.objects[name].shown_in, range(scene.views)), tuple(poses.camera1_from)
     turns = torch.tensor([0, *_TURNS_DEG], dtype=torch.float64)[:, None]
 
-    def loss(through: Tensor, along: Tensor) -> TurnLoss:
+    def loss(through: Tensor, along: Tensor) -> float:
         """About the line through a point (3,) along a direction (3,) in camera 1."""
         body = Body((name,), 0, through, torch.tensor([math.pi / 180] * 3 + [0] * 3, dtype=torch.float64))
         costs = image_costs(scene, poses, (body,), drawn, images, level, similarity, imaging=imaging)
-        found = costs(turns * along)
-        lost = found[1:] - found[0]
-        second = lost.sort(1).values[:, -2] if lost.shape[1] > 1 else torch.zeros(1)
-        return TurnLoss(float(lost.mean(1).min()), float(second.min()))
+        found = costs(turns * along).mean(1)
+        return float((found[1:] - found[0]).min())
 
     about_long_axis = loss(points.mean(0), long_axis(points))
     guide = scene.objects[name].guide
     if guide is None:
-        return about_long_axis, UNASKED
+        return about_long_axis, math.inf
     base, tip = transform_points(poses.camera1_from[name], torch.stack(guide))
     return about_long_axis, loss(base, (tip - base) / (tip - base).norm())
 

@@ -102,7 +102,7 @@ def find_start(
             raise InputError(
                 f"{len(usable)} usable landmarks found, at least {MINIMUM} are needed. Is this a {anatomy.name}, and "
                 "is `intensity` of the view right (raw: bone dark, log: bone bright)? Otherwise give the landmarks by "
-                "hand (--landmarks)."
+                "hand (--landmarks) or, if the image shows no four of them, poses to start from (--start)."
             )
         pnp = fitted(used, range(len(used)))
     except InputError as error:

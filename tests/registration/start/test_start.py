@@ -97,7 +97,7 @@ def test_a_picture_that_shows_more_when_turned_is_asked_to_be(display: Display, 
 
     with pytest.raises(InputError, match=rf"view1.tif: 1 usable .* 6 landmarks that agree.*turned: {turned}\}}"):
         start_by_detection(case, plain, find(image, CAMERA), find)
-    with pytest.raises(InputError, match=r"\(--landmarks\)\.$"):
+    with pytest.raises(InputError, match=r"\(--start\)\.$"):
         start_by_detection(case, plain, find(image, CAMERA), lambda *_: detection(1, inverted=False))
 
 
