@@ -289,7 +289,7 @@ def turned_labels(ct: Volume, labels: Volume) -> str | None:
 
 
 def _some_places(labels: Volume) -> Tensor:
-    """Indices (N, 3) along z, y and x of every so manieth voxel that a label map names."""
+    """Indices (N, 3) along z, y and x of voxels that a label map names, evenly chosen where there are many."""
     named = np.flatnonzero(labels.data.numpy())
     some = named[:: 1 + len(named) // _MOST_PLACES]
     return torch.from_numpy(np.stack(np.unravel_index(some, tuple(labels.data.shape)), 1))

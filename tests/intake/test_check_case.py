@@ -482,7 +482,8 @@ def test_a_device_image_that_was_inverted_is_told_as_that(files: Path, tmp_path:
     assert "looks like the negative of views[1].anatomy" in warnings[0]
 
 
-@pytest.mark.parametrize(("intensity", "exposure"), [("raw", 0.5), ("log", 1.0), ("raw", 1.8)])
+@pytest.mark.parametrize("intensity", ["raw", "log"])
+@pytest.mark.parametrize("exposure", [0.5, 1.0, 1.8])
 def test_images_with_and_without_the_device_that_are_exchanged_are_told(
     files: Path, tmp_path: Path, intensity: str, exposure: float
 ) -> None:

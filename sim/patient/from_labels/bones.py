@@ -34,7 +34,6 @@ _ABOVE_MM = 250.0  # spine kept above the femoral heads
 _END_MM = 9.0  # a bone that the map cuts off goes on by so much, so that the scan cuts it and no cap is seen
 _SHAFT_MM = -80.0  # lower than this against the head's centre, a femur is shaft
 _LEAST_SHAFT_MM = 10.0  # of the shaft that are needed to find its axis; with less it counts as upright
-_SOCKET_MM = 50.0  # what of a femur is farther from the hip bones does not lie in the socket
 _LEAST_FEMUR_MM = 70.0  # below the head's centre: with less the femur ends within its trochanters
 
 
@@ -163,7 +162,7 @@ def _linear(values: Array, index: Points, axis: int) -> Array:
 
 def _femoral_head(surface: Points, hips: Points) -> Points:
     """Centre and radius (4,) of the sphere through the part of a femur's `surface` that lies in the socket."""
-    gap = cKDTree(hips).query(surface, distance_upper_bound=_SOCKET_MM)[0]  # infinite beyond
+    gap = cKDTree(hips).query(surface)[0]
     return refitted_sphere(surface, gap < np.percentile(gap, 2) + 3)
 
 
